@@ -164,6 +164,10 @@ def test_straight_wings():
     np.testing.assert_allclose(found["wing_elevation"][0], raised, atol=1e-3)
     spread = (shoulders + 2 * wing * np.cos(np.radians(raised))) / (shoulders + 2 * wing)
     np.testing.assert_allclose(found["wing_spread"][0], spread, atol=1e-5)
+    shoulder = BIRD.joint_names.index("right_shoulder") - 1
+    uneven = straight_wings(10.0).copy()
+    uneven[..., shoulder, :] = straight_wings(50.0)[..., shoulder, :]
+    assert values_of(result(uneven, bird=STRAIGHT), bird=STRAIGHT)["wing_elevation"] == pytest.approx(30, abs=1e-3)
 
 
 # ------------------------------------------------------------------------------------------------------------ motion
@@ -305,6 +309,13 @@ def test_a_bird_that_withdraws_at_an_angle():
     np.testing.assert_allclose(found["facing_angle"][1], 0, atol=1e-3)
     np.testing.assert_allclose(found["approach_speed"][0], -0.2, rtol=1e-4)
     np.testing.assert_allclose(found["neighbour_approach_speed"][1], -0.2, rtol=1e-4)
+
+
+def test_only_movement_along_the_line_is_approach():
+    """A bird passes its neighbour at a distance of 2 m, and rises."""
+    x = 0.5 * (TIME_S - 1)
+    found = values_of(result(place_m=np.concatenate([moved(x, 0, 0.2 + 0.3 * TIME_S), moved(0, 2)])))
+    np.testing.assert_allclose(found["approach_speed"][0], -0.5 * x / np.hypot(x, 2), atol=1e-3)
 
 
 def test_a_bird_without_a_pose_is_no_neighbour():

@@ -46,6 +46,7 @@ def test_the_interval_is_that_of_whole_birds_drawn():
     found = sums_of_many(many)
     means = np.random.default_rng(1).choice(many, (20_000, 40)).mean(1)
     assert found.interval("iou") == pytest.approx(np.percentile(means, [2.5, 97.5]), rel=0.03)
+    assert found.interval("iou") == sums_of_many(many).interval("iou") != found.interval("iou", seed=1)
 
 
 def sums_of_many(values):

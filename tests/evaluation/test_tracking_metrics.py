@@ -66,6 +66,15 @@ def test_how_much_must_overlap(value, thresholds, mota, identity):
     assert hota(*both) == pytest.approx((thresholds / 19,) * 3)
 
 
+def test_exactly_at_a_threshold():
+    """An overlap of one half is a match, and keeps the track of a bird that another track fits better."""
+    both = case(*[{(0, 0): 0.5}] * 2)
+    assert (clear(*both).mota, idf1(*both)) == (1, 1)
+    assert hota(*both).hota == pytest.approx(10 / 19)
+    assert clear(*case(A, {(0, 0): 0.5, (0, 1): 0.9}, tracks=2)) == Clear(1 - 1 / 2, 0, 0)  # a false alarm
+    assert clear(*case(A, {(0, 0): 0.4, (0, 1): 0.9}, tracks=2)) == Clear(1 - 2 / 2, 1, 0)  # and a switch
+
+
 def test_nothing_at_all():
     both = np.zeros((3, 0, 0)), np.zeros((3, 0), bool), np.zeros((3, 0), bool)
     assert all(math.isnan(figure) for figure in (clear(*both).mota, idf1(*both), *hota(*both)))

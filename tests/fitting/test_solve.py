@@ -203,7 +203,9 @@ def compiled(caplog, name):
 
 
 NEWTON = dataclasses.replace(FIRST, solver="levenberg_marquardt")
-PLACE = dataclasses.replace(NEWTON, optimised=("global_orient", "transl", "scale"))
+PLACE = dataclasses.replace(
+    NEWTON, optimised=("global_orient", "transl", "scale"), terms=(*NEWTON.terms, "acceleration")
+)
 """Few enough parameters for conjugate gradients to converge. Most tests share its compiled program."""
 SHAPE = dataclasses.replace(
     NEWTON,

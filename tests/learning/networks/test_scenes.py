@@ -73,6 +73,16 @@ def test_only_missing_scenes_are_filmed_with_the_shares_of_the_folder(filmed, tm
         film_scenes(tmp_path / "wings", 2, 0.25, 0.0)
 
 
+def test_the_end_of_a_process_is_one_error(monkeypatch, tmp_path):
+    def film(*_arguments, **_shares):
+        raise scenes.BrokenProcessPool
+
+    monkeypatch.setattr(scenes, "film_scene", film)
+    monkeypatch.setattr(scenes, "ProcessPoolExecutor", Pool)
+    with pytest.raises(InputError, match="the system ended a process that films scenes"):
+        film_scenes(tmp_path / "scenes", 3)
+
+
 def test_folders_of_other_files_are_rejected(filmed, tmp_path):
     (tmp_path / "holiday.png").touch()
     with pytest.raises(InputError, match=r"holds other files than simulated scenes: holiday.* .*--frames"):
