@@ -52,7 +52,7 @@ _FAMILIES = {
     "dataset": "convert published data sets",
     "model": "download, import, describe and draw bird models",
     "networks": "download published networks",
-    "prior": "learn a prior of poses or of motion from results",
+    "prior": "learn a prior of poses from results",
 }
 """First word of the commands of two words → its description."""
 

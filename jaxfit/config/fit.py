@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from annotated_types import Ge, MinLen
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -71,7 +71,6 @@ def term_settings(value: Any) -> dict[str, float]:
 
 Parameter = Literal["global_orient", "body_pose", "transl", "scale", "bone_length", "betas"]
 """A parameter of a pose that a stage can optimise."""
-PARAMETERS = get_args(Parameter)
 GROUPS = ("published settings to reproduce", "settings to use")
 """Groups of shipped configs of fits."""
 
