@@ -36,6 +36,7 @@ from jaxfit.learning.networks import keypoints, segmenter
 from jaxfit.learning.networks.label_data import (
     ALL_FRAMES,
     FRAMES,
+    PICTURES,
     TRACKED,
     FineTuningData,
     LabelFiles,
@@ -178,6 +179,12 @@ def fine_tune(
     steps = None if settings.schedule is None else settings.schedule.steps
     check_numbers(True, steps, settings.scenes, settings.seed, holdout=settings.holdout)
     check_writable(path)  # before the training, not after it
+    if folder.is_dir():  # it is removed at the end
+        own = ".", PICTURES, FRAMES, ALL_FRAMES, TRACKED, CHECKED, "checkpoint"
+        others = sorted(file.name for file in folder.iterdir() if not file.name.startswith(own))
+        if others:
+            problem = f"holds other files than those of a training: {others[0]}"
+            raise InputError(folder, problem, "move these files, or choose another --out")
     base = base_file(network, settings.base)
     teacher = open_teacher(settings.teacher) if network == "segmenter" else None
     taught: Taught | None = None

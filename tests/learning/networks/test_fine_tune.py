@@ -176,6 +176,15 @@ def test_wrong_use_of_the_command(tmp_path, capsys, monkeypatch, options, messag
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frame_0000.png", "labels.json"]
 
 
+def test_other_files_in_the_folder_of_a_training_stay(tmp_path):
+    (tmp_path / "mine.onnx.training").mkdir()
+    (tmp_path / "mine.onnx.training" / "labels.json").write_text("precious")
+    labels = fine_tune.LabelFiles((write_labels(tmp_path, coco({0: [bird()]}), [0]),))
+    with pytest.raises(InputError, match=r"holds other files than those of a training: labels\.json"):
+        fine_tune.fine_tune("segmenter", labels, tmp_path / "mine.onnx", tmp_path / "frames")
+    assert (tmp_path / "mine.onnx.training" / "labels.json").read_text() == "precious"
+
+
 def test_pictures_are_read_before_scenes_are_filmed(tmp_path, monkeypatch, caplog):
     """Pictures that do not fit the labels are reported at once, and an interruption says how to continue."""
     file = write_labels(tmp_path / "labels", coco({t: [bird()] for t in TIMES}), [])
