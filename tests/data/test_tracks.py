@@ -33,7 +33,7 @@ def record(frames, names=NAMES):
     recorded = []
     for t, birds in frames.items():
         points = np.array([[[x + k, t] for k in range(len(names))] for _, x in birds], np.float32)
-        confidence = np.tile(np.linspace(0, 1, len(names)), (len(birds), 1))
+        confidence = np.array([np.linspace(0, 1 - x / 100, len(names)) for _, x in birds]).reshape(-1, len(names))
         instances = [blob(x, 5, 0.5 + x / 100) for _, x in birds]
         identities = [one for one, _ in birds]
         points = points.reshape(-1, len(names), 2)
@@ -65,7 +65,7 @@ def test_frames_become_observations(tmp_path):
     assert seen.skeleton == ((0, 1),)
     np.testing.assert_array_equal(seen.box_px[1, 3], [40, 5, 10, 6])
     np.testing.assert_array_equal(seen.keypoints_px[1, 3], [[0, 0], [41, 7], [42, 7]])  # the first was not found
-    np.testing.assert_array_equal(seen.confidence[1, 3], [0, 0.5, 1])
+    np.testing.assert_allclose(seen.confidence[1, 3], [0, 0.3, 0.6])
     np.testing.assert_allclose(seen.score, [[0.5, 0.54, 0, 0], [0.8, 0, 0, 0.9]])
     assert seen.mask(1, 3).sum() == 59
     assert not seen.mask(1, 3)[5, 40]
