@@ -89,7 +89,8 @@ def _download(published: PublishedFile, path: Path, progress: ProgressTask) -> N
 
     pooch.get_logger().setLevel("WARNING")
     with progress(f"download of {path.name}", None) as report_progress:
-        downloader = pooch.HTTPDownloader(progressbar=_Bar(report_progress), timeout=_SECONDS)
+        bar: Any = _Bar(report_progress)  # pooch's types allow a bool only, its documents a bar too
+        downloader: Any = pooch.HTTPDownloader(progressbar=bar, timeout=_SECONDS)
         try:
             pooch.retrieve(
                 published.url, f"sha256:{published.sha256[0]}", path.name, path.parent, downloader=downloader
