@@ -83,6 +83,9 @@ class Evaluation:
         Raises:
             ValueError: an entry is missing or has another form.
         """
+        for name in ("frames_3d", "intervals", "behaviours", "keypoints", "sums"):  # which have a default
+            if name not in content:
+                raise ValueError(f"has no {name}")
         overall = {name: content[name] for name in (*COLUMNS, *COLUMNS_3D) if name in content}
         return pydantic.TypeAdapter(cls).validate_python({**content, "overall": overall})
 

@@ -93,6 +93,8 @@ def test_all_of_it_can_be_stored():
         text = json_text(result.to_dict())
         assert "NaN" not in text
         back = Evaluation.from_dict(json.loads(text))
+        with pytest.raises(ValueError, match="has no sums"):
+            Evaluation.from_dict({name: value for name, value in json.loads(text).items() if name != "sums"})
         assert json_text(back.to_dict()) == text
         assert back.sums == result.sums
         assert set(back.tracks) == set(result.tracks)
