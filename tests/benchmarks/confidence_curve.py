@@ -21,7 +21,6 @@ from jaxfit.evaluation import metrics
 from jaxfit.evaluation.detection import assign
 from jaxfit.foundation.errors import InputError
 from jaxfit.learning.networks.labelled_frames import LabelledFrames, load_frames
-from jaxfit.learning.networks.network_files import set_metadata
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.network import CONFIDENCE_KEY, Curve, KeypointDetector, Segmenter
 from jaxfit.perception.segmentation import load_segmenter
@@ -123,4 +122,6 @@ if __name__ == "__main__":
     detector = load_keypoint_detector(options.network)
     detector.curve = None  # a curve that the file holds is replaced
     curve = fit_curve(keypoint_outcomes(known, load_segmenter("builtin"), detector), options.network)
+    from jaxfit.learning.networks.network_files import set_metadata  # needs PyTorch
+
     set_metadata(options.network, {CONFIDENCE_KEY: curve.text()})
