@@ -70,7 +70,7 @@ def random_targets(seed=0):
         has_mask=np.ones(T, bool),
         present=np.ones(T, bool),
         corner_px=np.float32(rng.uniform(0, 5, (T, 2))),
-        frame_s=np.float32(FRAME_S),
+        frame_s=np.array(FRAME_S, np.float32),
     )
     return jax.device_put(targets)
 

@@ -162,7 +162,7 @@ def test_a_filmed_scene(tmp_path):
     on_bird = 0
     for s, n, k in visible:
         x, y = frames.keypoints_px[s, n, k].astype(int)
-        on_bird += (frames.owner[s, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] == n + 1).any()
+        on_bird += (frames.owner[s][max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] == n + 1).any()
     assert on_bird > 0.99 * len(visible)  # the thinnest tips fall between pixels
     seed = next(seed for seed in range(9) if np.random.default_rng((seed, 11)).random() >= 0.5)
     np.testing.assert_array_equal(frames.pictures, draw_scene(0, varied=0.5 if seed == 0 else 0).pictures)
