@@ -12,6 +12,17 @@ const MARGIN_S = 1e-3;
 /** Longest wait for the picture of a film at rest, milliseconds. */
 const SHOWN_MS = 200;
 
+/** Position of the last frame that begins before a time. @param {number[]} times @param {number} time @param {number} margin */
+export function positionAt(times, time, margin = MARGIN_S) {
+  let low = 0, high = times.length - 1;
+  while (low < high) {
+    const middle = Math.ceil((low + high) / 2);
+    if (times[middle] <= time + margin) low = middle;
+    else high = middle - 1;
+  }
+  return low;
+}
+
 /** The pictures of the film: a video element, or single pictures of the server. */
 export class Film {
   /** @param {import("viewer/data").FilmFacts} facts @param {(number | null)[]} times_s @param {number[]} frames */
@@ -52,13 +63,8 @@ export class Film {
 
   /** Position of the frame that a playing film shows, −1 for a frame between those of the results. @param {number} time */
   positionAt(time) {
-    let low = 0, high = this.times_s.length - 1;
-    while (low < high) {
-      const middle = Math.ceil((low + high) / 2);
-      if (this.times_s[middle] <= time + this.margin) low = middle;
-      else high = middle - 1;
-    }
-    return Math.abs(this.times_s[low] - time) <= this.margin || !this.gaps ? low : -1;
+    const i = positionAt(this.times_s, time, this.margin);
+    return Math.abs(this.times_s[i] - time) <= this.margin || !this.gaps ? i : -1;
   }
 
   /** Moves the video to a frame; whether the video shows this frame. @param {HTMLVideoElement} video @param {number} i position of the frame */

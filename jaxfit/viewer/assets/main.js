@@ -2,7 +2,7 @@
 // @ts-check
 import { arrays, isSaved, readFacts } from "viewer/data";
 import { Corrections } from "viewer/corrections";
-import { Film, FilmView } from "viewer/film";
+import { Film, FilmView, positionAt } from "viewer/film";
 import { LedgeView } from "viewer/ledge";
 import { Timeline } from "viewer/timeline";
 
@@ -207,17 +207,6 @@ function pause() {
   state.playing = false;
   state.film?.video?.pause();
   refresh();
-}
-
-/** Position of the last frame that begins before a time. @param {number[]} times @param {number} time */
-function positionAt(times, time) {
-  let low = 0, high = times.length - 1;
-  while (low < high) {
-    const middle = Math.ceil((low + high) / 2);
-    if (times[middle] <= time + 1e-3) low = middle;
-    else high = middle - 1;
-  }
-  return low;
 }
 
 async function showValue() {
