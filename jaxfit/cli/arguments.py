@@ -96,6 +96,17 @@ def add_shared(command: Arguments, *names: str) -> None:
         command.add_argument(name, **SHARED[name])
 
 
+class _Dropped(argparse.Action):
+    """An option of earlier versions, whose use is an error that says what to do."""
+
+    def __init__(self, remedy: str, **settings: Any):
+        super().__init__(**settings, help=argparse.SUPPRESS)
+        self._remedy = remedy
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> NoReturn:
+        raise InputError(option_string, "is no option any more", self._remedy)
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that reports wrong arguments in one line, and exits with code 2."""
 
@@ -112,6 +123,10 @@ class Parser(argparse.ArgumentParser):
     def shared(self, *names: str) -> None:
         """Add arguments that several commands have, by their names in `SHARED`."""
         add_shared(self, *names)
+
+    def dropped(self, name: str, remedy: str, nargs: int | None = None) -> None:
+        """Add an option of earlier versions, whose use is an InputError with this remedy."""
+        self.add_argument(name, action=_Dropped, remedy=remedy, nargs=nargs)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse arguments; the parser of all commands calls this function of the parser of one command."""

@@ -6,7 +6,6 @@ import argparse
 import time
 
 from jaxfit.cli.tables import counted, show
-from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.progress import terminal
 from jaxfit.model.files import find_bird
@@ -20,8 +19,6 @@ def ablate(options: argparse.Namespace) -> None:
     from jaxfit.evaluation.ablation.table import CAPTION, claims_table, results_table
     from jaxfit.foundation.workers import open_cluster
 
-    if options.allow_import is not None:
-        raise InputError("--allow-import", "is no option any more", "name the term in the grid")
     start = time.perf_counter()
     bird = find_bird(options.model)
     with open_cluster(options.workers, options.scheduler) as cluster:

@@ -64,9 +64,9 @@ def main(arguments: list[str] | None = None) -> int:
     """
     if (sys.argv[1:] if arguments is None else arguments)[:1] == ["bench"]:
         return _rejected(InputError("bench", "was removed", "in a checkout of jaxfit, `make bench` measures the speed"))
-    options = build_parser().parse_args(arguments)
-    _prepare_logging(options.verbose)
     try:
+        options = build_parser().parse_args(arguments)
+        _prepare_logging(options.verbose)
         use_cache()
         module, command = options.run.split(".")
         if command != "doctor":  # which reports the variable

@@ -81,9 +81,6 @@ def prior_learn(options: argparse.Namespace) -> None:
     from jaxfit.foundation.files import check_writable
     from jaxfit.learning.priors import learn_prior
 
-    if options.motion:
-        remedy = "set terms.motion_likelihood in a config, as `jaxfit config show map` prints it"
-        raise InputError("--motion", "is no option any more", remedy)
     check_writable(options.out)  # before the long work
     learnt = learn_prior([(folder, *load_solution(folder)) for folder in options.results])
     counts = {"poses": learnt.poses, "birds": learnt.birds, "effective_poses": learnt.effective_poses}

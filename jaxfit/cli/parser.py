@@ -178,7 +178,8 @@ def _train(command: Parser) -> None:
     command.add_argument("--varied", type=float, default=0.0, metavar="SHARE", help=text)
     text = "without labels: share of scenes in which the birds flap or fly (default %(default)s)"
     command.add_argument("--wings", type=float, default=0.0, metavar="SHARE", help=text)
-    command.add_argument("--encoder", help=argparse.SUPPRESS)  # an option of earlier versions
+    text = "leave it out: a segmenter starts from the encoder of the built-in segmenter; or give --base"
+    command.dropped("--encoder", text)
     command.add_argument("--steps", type=int, help="number of training steps (default: by the number of labels)")
     command.add_argument("--seed", type=int, default=0, help="seed of new weights and of samples (default %(default)s)")
 
@@ -471,7 +472,8 @@ def _adapt_photos(command: Parser) -> None:
 def _prior_learn(command: Parser) -> None:
     """Learn a pose prior from the poses of results and write a model with this prior."""
     command.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="result folders of fits of one model")
-    command.add_argument("--motion", action="store_true", help=argparse.SUPPRESS)  # an option of earlier versions
+    text = "set terms.motion_likelihood in a config, as `jaxfit config show map` prints it"
+    command.dropped("--motion", text, nargs=0)
     add_out(command, "P.npz", "model file to write, for `--model`")
 
 
@@ -529,7 +531,7 @@ def _ablate(command: Parser) -> None:
     command.shared("--model")
     add_cluster(command)
     add_out(command, "DIR", "folder for runs, tables and report; an interrupted ablation continues")
-    command.add_argument("--allow-import", help=argparse.SUPPRESS)  # an option of earlier versions
+    command.dropped("--allow-import", "name the term in the grid")
 
 
 @_command("research", "dataset murre", "observations.murre")

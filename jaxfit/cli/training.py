@@ -54,9 +54,6 @@ def train(options: argparse.Namespace) -> None:
         raise InputError("--video", "is given with labels", "give the film of the labels by --images")
     if options.video and options.network != "segmenter":
         raise InputError("--video", "is given for keypoints", "a teacher makes masks: give labels by --labels")
-    if options.encoder:
-        remedy = "leave it out: a segmenter starts from the encoder of the built-in segmenter; or give --base"
-        raise InputError("--encoder", "is no option any more", remedy)
     if options.labels or options.video:
         _train_on_labels(options)
         return
