@@ -46,7 +46,7 @@ def crop_squares(
 
 def square_images(size_px: Int[np.ndarray, "T 2"]) -> bool:
     """Return whether images, of a width and a height, are square and of one size."""
-    return bool((size_px == size_px[0, 0]).all())
+    return len(np.unique(size_px)) <= 1
 
 
 def _around_the_bird(

@@ -181,8 +181,8 @@ def fit_runs(
     skipped = report_distant_birds(observations, source)
     if not observations.masks:
         configs = _without_mask_stages(configs, source)
-    if configs[0].crop.mode == "image" and not square_images(observations.image_sizes_px()[observations.present]):
-        _logger.warning("%s: the images are not square and of one size, so the crops follow the birds", source)
+    if configs[0].crop.mode == "image":
+        _report_other_images(observations, source)
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
@@ -239,6 +239,15 @@ def model_of_fit(bird: Bird, config: FitConfig, initial_poses: InitialPoses | No
     model = fit_model(_fitted_bird(bird, config, initial_poses), config, initial_poses)
     check_terms(config, model)
     return model
+
+
+def _report_other_images(observations: Observations, source: object) -> None:
+    """Report the birds whose images are not square and of one size, so that their crops follow the birds."""
+    sizes_px = observations.image_sizes_px()
+    birds = sum(not square_images(sizes_px[n, seen]) for n, seen in enumerate(observations.present))
+    if birds:
+        text = "%s: the images of %d of %d birds are not square and of one size, so their crops follow the birds"
+        _logger.warning(text, source, birds, observations.num_tracks)
 
 
 def _without_mask_stages(configs: Sequence[FitConfig], source: object) -> list[FitConfig]:
