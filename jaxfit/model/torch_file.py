@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import pickletools
 import struct
 import zipfile
 from collections import OrderedDict
@@ -35,6 +36,7 @@ STORAGE_DTYPES = {
     "ByteStorage": "|u1",
 }
 LEGACY_MAGIC, LEGACY_PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
+_MAX_MEMO = 1_000_000
 
 
 class _StorageType(NamedTuple):
@@ -58,12 +60,19 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
 
-class _Unpickler(pickle._Unpickler):  # in Python: for one wrong number, that in C reserves the memory of the machine
+class _Unpickler(pickle.Unpickler):
     """Builds dicts, lists, numbers, text and `_Tensor`; notes the storages by key."""
 
     def __init__(self, file: io.BytesIO):
         super().__init__(file)
         self.storages: dict[str, _Storage] = {}
+        start = file.tell()
+        for opcode, argument, _ in pickletools.genops(file):  # also checks the lengths of texts
+            if (
+                opcode.name in ("PUT", "LONG_BINPUT") and int(argument or 0) > _MAX_MEMO
+            ):  # memory for all smaller numbers
+                raise pickle.UnpicklingError("it numbers its parts beyond any checkpoint")
+        file.seek(start)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
