@@ -55,7 +55,7 @@ class Work:
 
 
 class EditsChangedError(InputError):
-    """The edits are not those that a page shows."""
+    """The file of edits differs from the list that the page shows."""
 
 
 class Session:

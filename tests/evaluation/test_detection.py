@@ -136,9 +136,9 @@ def without_mask(truth):
 @pytest.mark.parametrize(
     ("truth", "found", "counts", "precision"),
     [
-        # a bird that is hidden altogether excuses nobody
+        # a completely hidden bird is no ignored region
         (birds({1: steady(WHOLE, [0, 1])}, [0, 1], visible={(1, 1): None}), {1: steady(WHOLE, [0, 1])}, (1, 1, 0), 0.5),
-        # everybody inside a crowd is excused, however many
+        # a crowd is an ignored region for any number of birds
         (
             without_mask(birds({1: {0: HERE}, 2: {0: CROWD}}, [0])),
             {1: {0: HERE}, 2: {0: (55, 5, 20, 10)}, 3: {0: (80, 5, 20, 10)}, 4: {0: AWAY}},
