@@ -27,8 +27,8 @@ class InputError(ValueError):
         super().__init__(f"{source_text}: {problem_text}" + (f" ({remedy_text})" if remedy else ""))
 
     def __reduce__(self) -> tuple:
-        """Return the constructor and its arguments, so that an error can pass between processes."""
-        return type(self), (self.source, self.problem, self.remedy)
+        """Return how to build the error again, with the fields of its class, so that it can pass between processes."""
+        return ValueError.__new__, (type(self), *self.args), vars(self)
 
 
 def one_line(text: object) -> str:

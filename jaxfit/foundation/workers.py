@@ -67,7 +67,8 @@ class Cluster:
             The number and the result of every task, in the order of arrival.
 
         Raises:
-            InputError: a task raised InputError; a worker has other versions of libraries; the scheduler ended.
+            InputError: a task raised InputError; a worker has other versions of libraries; the scheduler ended; or, at
+                the end, all tasks have failed.
         """
         from distributed import as_completed
 
@@ -86,10 +87,15 @@ class Cluster:
                 running.add(future)
 
         send()
+        result, has_result = None, False
         for future in running:
             i, result = number.pop(future.key), self._result(future)
+            has_result |= not isinstance(result, FailedTask)
             send()
             yield i, result
+        if isinstance(result, FailedTask) and not has_result:
+            remedy = "repeat the command without workers, which shows the cause"
+            raise InputError(self._name, f"no task could be computed: {result.reason}", remedy)
 
     def _result(self, future: Any) -> Any:
         """Return the result of a task that has finished.

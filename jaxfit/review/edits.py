@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfit.data.observations import CELLS, MAPPINGS, Observations
+from jaxfit.foundation.array_files import check_memory, observations_bytes
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import read_text
 
@@ -126,83 +127,76 @@ def apply_edits(observations: Observations, edits: Sequence[Edit], source: objec
     """Return the observations after all edits, one after the other.
 
     A new track gets the next free number. A track without a frame is removed. The frames stay, also those without a
-    bird.
+    bird. The arrays are moved once, after the last edit, so the time is linear in the number of edits.
 
     Raises:
-        InputError: a track or frame is not there, a track is named twice, joined tracks share a frame, or no track
-            would be left.
+        InputError: a track or frame is not there, a track is named twice, joined tracks share a frame, the tracks need
+            too much memory, or no track would be left.
     """
-    for edit in edits:
-        rows = [_row(observations, track, edit, source) for track in edit.tracks]
-        if len(set(rows)) < len(rows):
-            raise InputError(source, f"{edit}: names a track twice", "name different tracks")
-        frames = _frames(observations, edit, source)
-        if edit.kind == "swap":
-            observations = _moved(observations, {rows[0]: rows[1], rows[1]: rows[0]}, frames)
-        elif edit.kind == "cut":
-            observations = _moved(_with_empty_track(observations), {rows[0]: observations.num_tracks}, frames)
-        elif edit.kind == "join":
-            both = np.flatnonzero(observations.present[rows[0]] & observations.present[rows[1]])
-            if len(both):
-                problem = f"{edit}: both tracks have a bird in frame {observations.frame_index[both[0]]}"
-                raise InputError(source, problem, "cut a track, or delete the wrong part first")
-            present = observations.present[rows[1]]
-            observations = _moved(observations, {rows[1]: rows[0]}, present)
-            observations = observations.select(tracks=np.arange(observations.num_tracks) != rows[1])
-        elif edit.kind == "exclude":
-            observations = _moved(observations, {rows[0]: None}, frames)
-        else:
-            observations = observations.select(tracks=~np.isin(np.arange(observations.num_tracks), rows))
-        kept = observations.present.any(axis=1)
-        observations = observations.select(tracks=kept)
-    if not observations.num_tracks:
-        raise InputError(source, "has no track left after the corrections", "delete or exclude less")
-    return observations
-
-
-def _row(observations: Observations, track: int, edit: Edit, source: object) -> int:
-    at = np.flatnonzero(observations.track_id == track)
-    if not len(at):
-        known = ", ".join(map(str, observations.track_id.tolist()[:20]))
-        raise InputError(source, f"{edit}: there is no track {track}", f"its tracks are {known}")
-    return int(at[0])
-
-
-def _frames(observations: Observations, edit: Edit, source: object) -> np.ndarray:
-    """Return which frames an edit changes, (T,) bool."""
+    N, T, K = observations.confidence.shape
     numbers = observations.frame_index
     first, last = int(numbers[0]), int(numbers[-1])
-    start = first if edit.start is None else edit.start
-    stop = last + 1 if edit.stop is None else edit.stop
-    if not (first <= start <= last and start < stop <= last + 1):
-        raise InputError(source, f"{edit}: there are no such frames", f"its frames are {first}:{last + 1}")
-    return (numbers >= start) & (numbers < stop)
+    rows_of = np.where(observations.present, np.arange(N)[:, None], -1)
+    origin = {int(track): row for track, row in zip(observations.track_id, rows_of, strict=True) if (row >= 0).any()}
+    """Track → row of the observations that the track has in every frame (T,); −1 without a bird."""
+    largest = max(origin, default=0)
+    for edit in edits if origin else ():
+        for track in edit.tracks:
+            if track not in origin:
+                known = ", ".join(map(str, list(origin)[:20]))
+                raise InputError(source, f"{edit}: there is no track {track}", f"its tracks are {known}")
+        if len(set(edit.tracks)) < len(edit.tracks):
+            raise InputError(source, f"{edit}: names a track twice", "name different tracks")
+        start = first if edit.start is None else edit.start
+        stop = last + 1 if edit.stop is None else edit.stop
+        if not (first <= start <= last and start < stop <= last + 1):
+            raise InputError(source, f"{edit}: there are no such frames", f"its frames are {first}:{last + 1}")
+        frames, rows = (
+            slice(*np.searchsorted(numbers, (start, stop)).tolist()),
+            [origin[track] for track in edit.tracks],
+        )
+        if edit.kind == "swap":
+            rows[0][frames], rows[1][frames] = rows[1][frames].copy(), rows[0][frames].copy()
+        elif edit.kind == "join":
+            both = np.flatnonzero((rows[0] >= 0) & (rows[1] >= 0))
+            if len(both):
+                problem = f"{edit}: both tracks have a bird in frame {numbers[both[0]]}"
+                raise InputError(source, problem, "cut a track, or delete the wrong part first")
+            np.maximum(rows[0], rows[1], out=rows[0])
+            rows[1][:] = -1
+        elif edit.kind == "delete":
+            for row in rows:
+                row[:] = -1
+        else:  # a cut or an exclusion
+            if edit.kind == "cut" and (rows[0][frames] >= 0).any():
+                largest += 1
+                origin[largest] = np.full(T, -1)
+                origin[largest][frames] = rows[0][frames]
+                needed = observations_bytes(len(origin), T, K)
+                check_memory(source, f"{len(origin):,} tracks over {T:,} frames", needed, "cut less")
+            rows[0][frames] = -1
+        for track in [track for track in edit.tracks if (origin[track] < 0).all()]:
+            del origin[track]
+            if track == largest:
+                largest = max(origin, default=0)
+    if not origin:
+        raise InputError(source, "has no track left after the corrections", "delete or exclude less")
+    return _with_tracks(observations, origin) if edits else observations
 
 
-def _moved(observations: Observations, target: dict[int, int | None], frames: np.ndarray) -> Observations:
-    """Return observations in which some rows have moved to other rows in some frames, or are removed there (None)."""
+def _with_tracks(observations: Observations, origin: dict[int, np.ndarray]) -> Observations:
+    """Return observations whose tracks have the birds of the rows `origin` (T,); −1 without a bird."""
+    rows = np.stack(list(origin.values()))
+    kept = rows >= 0
+    columns = np.arange(rows.shape[1])
+    target = np.full(observations.present.shape, -1)
+    target[rows[kept], np.broadcast_to(columns, rows.shape)[kept]] = np.nonzero(kept)[0]
     arrays: dict[str, Any] = {}
     for name in CELLS:
-        old = np.asarray(getattr(observations, name))
-        new = old.copy()
-        for row in target:
-            new[row, frames] = 0
-        for row, other in target.items():
-            if other is not None:
-                new[other, frames] = old[row, frames]
-        arrays[name] = new
+        values = np.asarray(getattr(observations, name))[rows, columns]
+        values[~kept] = 0
+        arrays[name] = values
     for name in MAPPINGS:
-        mapping = getattr(observations, name)
-        places = (((target.get(n, n) if frames[t] else n), t, value) for (n, t), value in mapping.items())
-        arrays[name] = {(n, t): value for n, t, value in places if n is not None}
-    return replace(observations, **arrays)
-
-
-def _with_empty_track(observations: Observations) -> Observations:
-    """Return the observations with one more track, whose number is the next after the largest number."""
-    arrays: dict[str, Any] = {}
-    for name in CELLS:
-        values = np.asarray(getattr(observations, name))
-        arrays[name] = np.concatenate([values, np.zeros_like(values[:1])])
-    number = int(observations.track_id.max()) + 1
-    return replace(observations, track_id=np.append(observations.track_id, number), **arrays)
+        places = ((int(target[n, t]), t, value) for (n, t), value in getattr(observations, name).items())
+        arrays[name] = {(n, t): value for n, t, value in places if n >= 0}
+    return replace(observations, track_id=np.array(list(origin)), **arrays)

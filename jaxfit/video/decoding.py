@@ -10,6 +10,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -67,7 +68,7 @@ class NumberedPicture(NamedTuple):
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a file. Gives its container and its default video stream.
+    """Open a file. Gives its container and its default video stream, as FFmpeg chooses it.
 
     Raises:
         InputError: the file is not a readable video.
@@ -86,8 +87,19 @@ def opened(path: Path) -> Iterator[tuple[Any, Any]]:
                 raise InputError(path, "has no video stream", "give a video or a folder of images")
             if stream.codec_context is None:
                 raise InputError(path, "has a codec that this PyAV cannot decode", "convert the video to H.264")
+            films = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
+            if len(films) > 1:
+                _warn_of_streams(path, films.index(stream) + 1, tuple((each.width, each.height) for each in films))
             stream.thread_type = "SLICE"  # with threads for frames, the detected damage would vary from run to run
             yield container, stream
+
+
+@cache  # one line in a process
+def _warn_of_streams(path: Path, number: int, sizes_px: tuple[tuple[int, int], ...]) -> None:
+    shown = ", ".join(f"{width}×{height}" for width, height in sizes_px)
+    text = "%s: has %d video streams (%s); number %d is read, the default stream"
+    text += "; programs that read by OpenCV take number 1" if number > 1 else ""
+    _logger.warning(text, path, len(sizes_px), shown, number)
 
 
 def frame_count(stream: Any) -> int | None:

@@ -79,6 +79,22 @@ def test_a_track_without_frames_disappears():
         apply_edits(before, [Edit("delete", (5,)), Edit("exclude", (5,), 100)], "x")
 
 
+def test_many_edits_move_the_arrays_once(tmp_path, monkeypatch):
+    path, moves = tmp_path / "edits.txt", []
+    path.write_text("cut 4@110\n" * 120_000)
+    monkeypatch.setattr("jaxfit.review.edits.replace", lambda *a, **k: moves.append(1) or dataclasses.replace(*a, **k))
+    after = apply_edits(observations(), read_edits(path), "x")
+    assert len(moves) == 1
+    assert after.track_id.tolist() == [2, 4, 5, 6]  # later cuts find no bird to move
+    assert np.flatnonzero(after.present[3]).tolist() == list(range(10, 17))
+
+
+def test_cuts_are_bounded_by_the_memory(monkeypatch):
+    monkeypatch.setattr("jaxfit.review.edits.observations_bytes", lambda tracks, *_: 1e9 * tracks)
+    with pytest.raises(InputError, match=r"x: 4 tracks over 17 frames need 4.0 GB, more than 2 GB \(cut less\)"):
+        apply_edits(observations(), [Edit("cut", (4,), 110)], "x")
+
+
 @pytest.mark.parametrize("text", TEXTS)
 def test_the_text_of_an_edit(text):
     assert parse_edit(text, "x") == TEXTS[text]

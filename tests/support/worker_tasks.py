@@ -44,6 +44,10 @@ def failing(shared, task):
     return task
 
 
+def ending(_model, _task, _report_progress=None):
+    raise MemoryError
+
+
 def refusing(_shared, task):
     if task == 1:
         raise InputError("term 'far'", "cannot be imported", "install it")

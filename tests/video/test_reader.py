@@ -5,6 +5,7 @@ import logging
 import av
 import numpy as np
 import pytest
+from av.stream import Disposition
 from support.films import COUNT, encode, number_in, overwrite, packets, reader_threads, write
 
 from jaxfit.foundation.errors import InputError
@@ -203,6 +204,30 @@ def test_files_that_are_not_videos(tmp_path):
             probe_video(tmp_path / name)
         with pytest.raises(InputError, match="is not a readable video"):
             frame_times(tmp_path / name, 5)
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+@pytest.mark.parametrize("default", [0, 1])
+def test_the_default_of_several_streams(tmp_path, caplog, suffix, default):
+    """The line names the stream, because OpenCV reads the first one in any case."""
+    path = tmp_path / f"two.{suffix}"
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream("mpeg4", rate=25) for _ in range(2)]
+        for i, stream in enumerate(streams):
+            stream.width, stream.height, stream.pix_fmt = 64 + 32 * i, 48, "yuv420p"
+            stream.disposition = Disposition.default if i == default else Disposition(0)
+        for number in range(6):
+            for i, stream in enumerate(streams):
+                picture = np.full((48, 64 + 32 * i, 3), 40 * number, np.uint8)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "bgr24")))
+        for stream in streams:
+            container.mux(stream.encode(None))
+    frames = list(read_frames(path))
+    assert probe_video(path).size_px == frames[5].picture.shape[1::-1] == (64 + 32 * default, 48)
+    assert len(frames) == 6
+    (line,) = caplog.messages
+    assert line.startswith(f"{path}: has 2 video streams (64×48, 96×48); number {default + 1} is read")
+    assert ("OpenCV take number 1" in line) == (default == 1)
 
 
 @pytest.mark.parametrize("name", ["sound.wav", "sound.mkv"])

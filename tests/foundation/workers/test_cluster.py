@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.cli_files import arguments, rejected
 from support.fits import BIRD, CAMERA, T, config, truths
-from support.worker_tasks import add, attempts, deadly, failing, quick_fit, refusing
+from support.worker_tasks import add, attempts, deadly, ending, failing, quick_fit, refusing
 
 from jaxfit.cli.main import main
 from jaxfit.fitting.fit import fit, fit_runs, windows_of
@@ -143,6 +143,19 @@ def test_a_task_is_repeated_and_then_fails(workers):
     assert results[2] == FailedTask("failed 3 times on the workers: RuntimeError: task 2")
     assert {i: results[i] for i in (0, 1, 3)} == {0: 0, 1: 1, 3: 3}
     assert [attempts.count(i) for i in range(4)] == [1, 3, 3, 1]
+
+
+def test_a_run_without_any_result_is_an_error(inputs, scheduler, workers, tmp_path, monkeypatch, capsys):
+    """The command ends with an exit code, and without a result of no poses."""
+    attempts.clear()
+    running = workers.run(failing, {1: 9}, [1])
+    assert next(running) == (0, FailedTask("failed 3 times on the workers: RuntimeError: task 1"))
+    with pytest.raises(InputError, match="no task could be computed: failed 3 times on the workers: RuntimeError: t"):
+        next(running)
+    monkeypatch.setattr("jaxfit.fitting.tasks.fit_task", ending)
+    options = [*arguments(inputs, tmp_path / "out"), "--scheduler", scheduler]
+    rejected(capsys, options, "no task could be computed")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_input_error_of_a_task_ends_the_run(workers):
