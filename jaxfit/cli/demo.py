@@ -138,7 +138,8 @@ def simulate_scene(options: argparse.Namespace) -> None:
 
     start = time.perf_counter()
     size = parsed_size(options.size)
-    numbers = {name: getattr(options, name) for name in ("birds", "frames", "fps", "seed", "codec", "overwrite")}
+    names = ("birds", "frames", "fps", "seed", "bone_sd", "keypoint_offset", "codec", "overwrite")
+    numbers = {name: getattr(options, name) for name in names}
     if options.cameras is None:
         if options.distortion:
             raise InputError("--distortion", "is given without --cameras", "give the number of cameras by --cameras")

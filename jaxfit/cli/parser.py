@@ -487,6 +487,12 @@ def _simulate(command: Parser) -> None:
     command.add_argument("--fps", type=float, default=25, help="frames per second (default %(default)s)")
     text = "random seed; every seed gives another scene (default %(default)s)"
     command.add_argument("--seed", type=int, default=0, help=text)
+    text = "standard deviation of the length of each bone between birds, as a share; 0: bones of the model"
+    command.add_argument("--bone-sd", type=float, default=0.05, metavar="SHARE", help=f"{text} (default %(default)s)")
+    text = "mean distance between the detector's keypoints and those of the model, as a share of the body length"
+    command.add_argument(
+        "--keypoint-offset", type=float, default=0.02, metavar="SHARE", help=f"{text} (default %(default)s)"
+    )
     text = "film the scene with several cameras: their number, or a file of calibrated cameras"
     command.add_argument("--cameras", metavar="N|FILE", help=text)
     text = "with a number of cameras: lenses with distortion, and principal points beside the middle of the picture"

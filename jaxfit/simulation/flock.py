@@ -16,6 +16,7 @@ from jaxfit.model.kinematics import Pose, fold_bird, window_joints, window_trans
 from jaxfit.model.murre import POSTURES
 from jaxfit.model.rotation import unwrap_axis_angle
 from jaxfit.simulation.behaviour import JAB_DISTANCE, Key, Keyframes, Motion, interpolate_keyframes
+from jaxfit.simulation.individuals import draw_bones
 from jaxfit.simulation.viewpoint import Viewpoint
 
 FRAMES_PER_KNOT = 20.0
@@ -97,7 +98,15 @@ class SimulatedBird:
 
 
 def simulate_flock(
-    bird: Bird, birds: int, frames: int, fps: float, ledge_depth: float, view: Viewpoint, seed: int, wings: bool = False
+    bird: Bird,
+    birds: int,
+    frames: int,
+    fps: float,
+    ledge_depth: float,
+    view: Viewpoint,
+    seed: int,
+    wings: bool = False,
+    bone_sd: float = 0.0,
 ) -> list[SimulatedBird]:
     """Simulate the motion of several birds on a ledge.
 
@@ -112,13 +121,15 @@ def simulate_flock(
         view: the camera.
         seed: seed of the motion.
         wings: every bird flaps again and again, or flies off.
+        bone_sd: standard deviation of the length of each bone between birds, as a share; it does not change the
+            behaviours.
     """
-    rng = np.random.default_rng((seed, 1))
+    rng, bones = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 6))
     positions = _draw_positions(rng, birds, ledge_depth, view)
     draw = _draw_wingbeats if wings else _draw_keyframes
     keyframes = draw(rng, positions, ledge_depth, frames / fps)
     motions = [interpolate_keyframes(keys, frames, fps) for keys in keyframes]
-    bodies = [_Body(bird, motion, rng, KNOT_S * fps) for motion in motions]
+    bodies = [_Body(bird, motion, rng, KNOT_S * fps, draw_bones(bird, bones, bone_sd)) for motion in motions]
     _separate(bodies, AVOIDANCE_S * fps)
     return [body.in_camera(view) for body in bodies]
 
@@ -211,7 +222,14 @@ def _choose_target(
 class _Body:
     """Poses of one bird on the ledge, world frame."""
 
-    def __init__(self, bird: Bird, motion: Motion, rng: np.random.Generator, frames_per_knot: float):
+    def __init__(
+        self,
+        bird: Bird,
+        motion: Motion,
+        rng: np.random.Generator,
+        frames_per_knot: float,
+        bone_length: Float[np.ndarray, "bones"],
+    ):
         frames = len(motion.pitch)
         self.motion, self.shift = motion, np.zeros((frames, 2))
         low, high = np.moveaxis(np.asarray(bird.joint_limits, np.float64), -1, 0)
@@ -229,7 +247,7 @@ class _Body:
             body_pose=jnp.asarray(self.body_pose, jnp.float32),
             transl=jnp.zeros((frames, 3)),
             scale=jnp.full(1, rng.normal(1, 0.03), jnp.float32),
-            bone_length=jnp.asarray(bird.bone_mean),
+            bone_length=jnp.asarray(bone_length),
             betas=jnp.asarray(0.7 * np.sqrt(variance) * rng.normal(size=len(variance)), jnp.float32),
         )
         self.pose = pose

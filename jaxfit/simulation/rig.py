@@ -21,7 +21,8 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.bird import Bird
 from jaxfit.model.rotation import unwrap_axis_angle
 from jaxfit.simulation.flock import SimulatedBird, simulate_flock
-from jaxfit.simulation.scene import LEDGE_DEPTH, VERSION, Scene, check_scene, film_scene, stage_view
+from jaxfit.simulation.individuals import BONE_SD, OFFSET
+from jaxfit.simulation.scene import LEDGE_DEPTH, VERSION, Scene, check_scene, film_scene, scene_offsets, stage_view
 from jaxfit.simulation.viewpoint import Viewpoint, ring_viewpoints, viewpoint_of
 
 CAMERAS = "cameras.toml"
@@ -47,6 +48,8 @@ def stage_rig(
     fps: float = 25.0,
     seed: int = 0,
     distorted: bool = False,
+    bone_sd: float = BONE_SD,
+    keypoint_offset: float = OFFSET,
     progress: ProgressTask = silent,
 ) -> RigScene:
     """Simulate birds on a ledge that several cameras see, with exact observations and detections for each camera.
@@ -55,7 +58,8 @@ def stage_rig(
         bird: the model, as for `simulation.scene.stage_scene`.
         cameras: number of cameras on an arc in front of the ledge, or calibrated cameras in metres, in the world frame
             of `RigScene.cameras`.
-        birds, frames, fps, seed: as for `stage_scene`.
+        birds, frames, fps, seed, bone_sd, keypoint_offset: as for `stage_scene`. The offsets of the
+            detector's keypoints are the same for all cameras.
         size: width and height of the pictures, pixels. Calibrated cameras have sizes of their own.
         distorted: whether the lenses of an arc have distortion.
         progress: reports every frame of every camera.
@@ -63,7 +67,7 @@ def stage_rig(
     Raises:
         InputError: a number outside its range, a model without a unit, or a camera that the simulator cannot describe.
     """
-    check_scene(birds, frames, size, fps, seed)
+    check_scene(birds, frames, size, fps, seed, bone_sd, keypoint_offset)
     unit_m = bird.metres_per_unit
     if unit_m is None:
         raise InputError(f"model {bird.name}", "has no `metres_per_unit`", "use the built-in murre")
@@ -76,13 +80,14 @@ def stage_rig(
     else:
         views = [viewpoint_of(camera, unit_m) for camera in cameras]
         for view in views:
-            check_scene(birds, frames, (view.width, view.height), fps, seed)
-    flock = simulate_flock(bird, birds, frames, fps, LEDGE_DEPTH, views[0], seed)
+            check_scene(birds, frames, (view.width, view.height), fps, seed, bone_sd, keypoint_offset)
+    flock = simulate_flock(bird, birds, frames, fps, LEDGE_DEPTH, views[0], seed, bone_sd=bone_sd)
+    offsets = scene_offsets(bird, seed, keypoint_offset)
     scenes = []
     for i, (camera, view) in enumerate(zip(cameras, views, strict=True)):
         own = [_seen_from(simulated, views[0], view) for simulated in flock] if i else flock
         own_seed = int(np.random.SeedSequence((seed, i)).generate_state(1)[0])
-        scene = stage_view(bird, own, view, fps, own_seed, progress, f"Staging {camera.name}")
+        scene = stage_view(bird, own, view, fps, own_seed, offsets, progress, f"Staging {camera.name}")
         scenes.append(scene._replace(detections=_with_own_ids(scene, own_seed)))
     return RigScene(tuple(cameras), tuple(scenes))
 
@@ -97,6 +102,8 @@ def simulate_rig(
     fps: float = 25.0,
     seed: int = 0,
     distorted: bool = False,
+    bone_sd: float = BONE_SD,
+    keypoint_offset: float = OFFSET,
     codec: str = "auto",
     overwrite: bool = False,
     progress: ProgressTask = silent,
@@ -107,7 +114,8 @@ def simulate_rig(
     `simulation.scene.simulate`.
 
     Args:
-        bird, cameras, birds, frames, size, fps, seed, distorted, progress: as for `stage_rig`.
+        bird, cameras, birds, frames, size, fps, seed, distorted, bone_sd, keypoint_offset, progress: as for
+            `stage_rig`.
         folder: folder to create; after an error it does not exist.
         codec: codec of the footage, as for `VideoWriter`.
         overwrite: replace an existing scene.
@@ -116,13 +124,14 @@ def simulate_rig(
         InputError: as for `stage_rig`, or the folder cannot be written.
     """
     with new_folder(folder, overwrite, marker=MARKER) as part:
-        rig = stage_rig(bird, cameras, birds, frames, size, fps, seed, distorted, progress)
+        bodies = {"bone_sd": bone_sd, "keypoint_offset": keypoint_offset}
+        rig = stage_rig(bird, cameras, birds, frames, size, fps, seed, distorted, **bodies, progress=progress)
         write_cameras(rig.cameras, part / CAMERAS)
         for camera, scene in zip(rig.cameras, rig.scenes, strict=True):
             own = part / camera.name
             own.mkdir()
             own_size = [scene.view.width, scene.view.height]
-            arguments = {"birds": birds, "frames": frames, "size": own_size, "fps": fps, "seed": seed}
+            arguments = {"birds": birds, "frames": frames, "size": own_size, "fps": fps, "seed": seed, **bodies}
             film_scene(bird, scene, own, arguments, codec, progress, f"Filming {camera.name}")
         facts = {"made_by": f"jaxfit {VERSION}, simulated", "cameras": [camera.name for camera in rig.cameras]}
         write_whole(part / MARKER, json.dumps(facts, indent=2).encode())

@@ -23,10 +23,12 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird, model_hash
 from jaxfit.model.camera import CropCamera
+from jaxfit.model.kinematics import fold_bird, move_keypoints, window_keypoints, window_transforms
 from jaxfit.raster.zbuffer import hard_mask, zbuffer
 from jaxfit.simulation.behaviour import BEHAVIOURS
 from jaxfit.simulation.flock import SimulatedBird, simulate_flock
 from jaxfit.simulation.footage import Footage, random_light
+from jaxfit.simulation.individuals import BONE_SD, OFFSET, draw_offsets
 from jaxfit.simulation.noise import simulate_detections
 from jaxfit.simulation.viewpoint import Viewpoint, random_viewpoint
 from jaxfit.video.writer import VideoWriter
@@ -121,6 +123,8 @@ def stage_scene(
     size: tuple[int, int] = (2592, 1520),
     fps: float = 25.0,
     seed: int = 0,
+    bone_sd: float = BONE_SD,
+    keypoint_offset: float = OFFSET,
     progress: ProgressTask = silent,
 ) -> Scene:
     """Simulate birds on a ledge, their exact observations, and the detections of a simulated detector.
@@ -132,15 +136,25 @@ def stage_scene(
         size: width and height of the picture, pixels.
         fps: frames per second.
         seed: 0 or more; the same seed gives the same scene.
+        bone_sd: standard deviation of the length of each bone between birds, as a share of the length; 0 gives every
+            bird the bones of the model. Cameras and behaviours do not depend on it.
+        keypoint_offset: mean distance between the keypoints of the detector and those of the model, as a share of the
+            body length (`draw_offsets`); the offsets are the same for all birds and frames. The truth is without them.
         progress: reports every frame.
 
     Raises:
         InputError: a number outside its range.
     """
-    check_scene(birds, frames, size, fps, seed)
+    check_scene(birds, frames, size, fps, seed, bone_sd, keypoint_offset)
     view = random_viewpoint(np.random.default_rng((seed, 0)), *size, LEDGE_DEPTH)
-    flock = simulate_flock(bird, birds, frames, fps, LEDGE_DEPTH, view, seed)
-    return stage_view(bird, flock, view, fps, seed, progress, "Staging the scene")
+    flock = simulate_flock(bird, birds, frames, fps, LEDGE_DEPTH, view, seed, bone_sd=bone_sd)
+    offsets = scene_offsets(bird, seed, keypoint_offset)
+    return stage_view(bird, flock, view, fps, seed, offsets, progress, "Staging the scene")
+
+
+def scene_offsets(bird: Bird, seed: int, mean: float) -> Float[np.ndarray, "K 3"]:
+    """Draw the offsets of the detector's keypoints in a scene; see `draw_offsets`."""
+    return draw_offsets(bird, np.random.default_rng((seed, 7)), mean)
 
 
 def stage_view(
@@ -149,6 +163,7 @@ def stage_view(
     view: Viewpoint,
     fps: float,
     seed: int,
+    offsets: Float[np.ndarray, "K 3"],
     progress: ProgressTask,
     title: str,
 ) -> Scene:
@@ -160,6 +175,7 @@ def stage_view(
         view: the camera.
         fps: frames per second.
         seed: seed of the detections.
+        offsets: offsets of the detector's keypoints, in the rest pose, model units.
         progress: reports every frame.
         title: text of the progress.
     """
@@ -206,7 +222,12 @@ def stage_view(
         fps=fps,
     )
     poses = _true_poses(bird, flock, view, truth, points, np.swapaxes(keypoints, 0, 1))
-    detections = simulate_detections(truth, visible, bird.keypoint_pairs, seed)
+    marked = truth
+    if offsets.any():
+        beside = keypoints + np.stack([_moved_world(bird, simulated, offsets, view) for simulated in flock], axis=1)
+        marked_px = np.swapaxes(view.to_screen(beside)[..., :2], 0, 1)
+        marked = truth.with_keypoints(np.where(labelled[..., None], marked_px, 0), truth.confidence)
+    detections = simulate_detections(marked, visible, bird.keypoint_pairs, seed)
     return Scene(flock, view, truth, poses, detections)
 
 
@@ -218,6 +239,8 @@ def simulate(
     size: tuple[int, int] = (2592, 1520),
     fps: float = 25.0,
     seed: int = 0,
+    bone_sd: float = BONE_SD,
+    keypoint_offset: float = OFFSET,
     codec: str = "auto",
     overwrite: bool = False,
     progress: ProgressTask = silent,
@@ -232,7 +255,7 @@ def simulate(
     Args:
         bird: the model, as for `stage_scene`.
         folder: folder to create; after an error it does not exist.
-        birds, frames, size, fps, seed, progress: as for `stage_scene`.
+        birds, frames, size, fps, seed, bone_sd, keypoint_offset, progress: as for `stage_scene`.
         codec: codec of the footage, as for `VideoWriter`.
         overwrite: replace an existing scene.
 
@@ -240,8 +263,9 @@ def simulate(
         InputError: a number outside its range, or the folder cannot be written.
     """
     with new_folder(folder, overwrite, marker=MARKER) as part:
-        scene = stage_scene(bird, birds, frames, size, fps, seed, progress)
-        arguments = {"birds": birds, "frames": frames, "size": list(size), "fps": fps, "seed": seed}
+        bodies = {"bone_sd": bone_sd, "keypoint_offset": keypoint_offset}
+        scene = stage_scene(bird, birds, frames, size, fps, seed, **bodies, progress=progress)
+        arguments = {"birds": birds, "frames": frames, "size": list(size), "fps": fps, "seed": seed, **bodies}
         film_scene(bird, scene, part, arguments, codec, progress, "Filming")
     return scene
 
@@ -283,7 +307,25 @@ def film_scene(
     write_whole(folder / MARKER, json.dumps(_description(scene, arguments), indent=2).encode())
 
 
-def check_scene(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> None:
+def _moved_world(
+    bird: Bird, simulated: SimulatedBird, offsets: Float[np.ndarray, "K 3"], view: Viewpoint
+) -> Float[np.ndarray, "T K 3"]:
+    """Return the shifts of the posed keypoints whose rest positions are moved by offsets, world frame."""
+    rig = fold_bird(bird)
+    A = window_transforms(rig, simulated.pose)
+    own, moved = (window_keypoints(each, A, simulated.pose) for each in (rig, move_keypoints(rig, offsets)))
+    return np.asarray(moved - own, np.float64) @ view.R_cam_world
+
+
+def check_scene(
+    birds: int,
+    frames: int,
+    size: tuple[int, int],
+    fps: float,
+    seed: int,
+    bone_sd: float,
+    keypoint_offset: float,
+) -> None:
     """Raise InputError if an argument of a simulation lies outside its range."""
 
     def require(name: str, value: object, holds: bool, remedy: str) -> None:
@@ -301,6 +343,8 @@ def check_scene(birds: int, frames: int, size: tuple[int, int], fps: float, seed
     require("size", "x".join(map(str, size)), sides_fit, remedy)
     require("fps", fps, 5 <= fps <= 240, "give 5 to 240 frames a second")
     require("seed", seed, 0 <= seed < 2**32, "give a whole number from 0")
+    require("bone_sd", bone_sd, 0 <= bone_sd <= 0.15, "give 0 (equal bones) to 0.15")
+    require("keypoint_offset", keypoint_offset, 0 <= keypoint_offset <= 0.2, "give 0 (no offsets) to 0.2")
 
 
 def _true_poses(

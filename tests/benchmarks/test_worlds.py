@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.birds import toy_bird
 
+from jaxfit.data.observations import Observations
 from jaxfit.evaluation.bootstrap import BirdSums
 from jaxfit.evaluation.metrics import distances, procrustes_align
 from jaxfit.foundation.errors import InputError
@@ -44,7 +45,12 @@ def pictures(scenes):
     return scenes.pictures_of(toy_bird(), 1, range(2), 2)
 
 
-@pytest.mark.parametrize("name", ["window", "pictures"])
+@pytest.fixture(scope="module")
+def individuals(scenes):
+    return scenes.windows_of(toy_bird(), (3, 1), 2, 4, scenes._gaussian_errors, scenes._individual)
+
+
+@pytest.mark.parametrize("name", ["window", "individuals", "pictures"])
 def test_true_poses_have_no_error(name, worlds, request):
     scene = request.getfixturevalue(name)
     sums, missing = worlds.measure(scene.poses, scene, name == "pictures")
@@ -86,13 +92,66 @@ def test_rotation_and_size_are_no_aligned_error(window, worlds):
 
 def test_annotators_keypoints_are_constant_and_near(scenes):
     bird = toy_bird()
-    first, second = (scenes._annotator_offsets(bird, np.random.default_rng(seed)) for seed in (1, 1))
+    first, second = (scenes.draw_offsets(bird, np.random.default_rng(seed)) for seed in (1, 1))
     np.testing.assert_array_equal(first, second)
     share = np.linalg.norm(first, axis=1) / np.linalg.norm(np.subtract((0, 9, 2.8), (0, -7.9, 0)))
     assert (share > 0.009).all()
     assert (share < 0.031).all()
     for left, right in bird.keypoint_pairs:
         np.testing.assert_allclose(first[left], first[right] * [-1, 1, 1])
+
+
+def test_grown_masks_include_pixels_near_the_bird(scenes):
+    """A rectangle from (10.3, 20.1) to (30.2, 25.7): pixels with centres within 0.7 px are inside, but for corners."""
+    corners = np.float32([[10.3, 20.1, 5], [30.2, 20.1, 5], [30.2, 25.7, 5], [10.3, 25.7, 5]])
+    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5)
+    outside = np.hypot(np.maximum(np.maximum(10.3 - x, x - 30.2), 0), np.maximum(np.maximum(20.1 - y, y - 25.7), 0))
+    for px in (0.44, 0.7):
+        mask = scenes.grown_mask(corners, np.array([[0, 1, 2], [0, 2, 3]]), 64, px)
+        assert mask[outside < px - 0.15].all()
+        assert not mask[outside > px + 0.15].any()
+    assert scenes.grown_mask(corners - [10, 0, 0], np.array([[0, 1, 2], [0, 2, 3]]), 64, 0.7)[22, 0]
+
+
+def test_errors_of_world_7_are_correlated_and_grow_with_speed(scenes):
+    rng, still = np.random.default_rng(0), np.zeros((2, 2000, 40, 2))
+    fast = still + 20.0 * (np.arange(2000) % 2)[:, None, None] * [1, 0]  # 20 px a frame
+    for points, sd in ((still, 3.0), (fast, np.hypot(3.0, 0.15 * 20))):
+        exact = Observations(
+            track_id=np.arange(2),
+            frame_index=np.arange(2000),
+            present=np.ones((2, 2000), bool),
+            keypoints_px=points,
+            confidence=np.ones((2, 2000, 40)),
+            box_px=np.ones((2, 2000, 4)),
+            image_size_px=np.full((2000, 2), 512),
+            file_name=np.arange(2000).astype(str),
+            keypoint_names=tuple(f"k{k}" for k in range(40)),
+        )
+        error = scenes._correlated_errors(rng, exact).keypoints_px[:, :-1] - points[:, :-1]
+        near = (np.abs(error) < 4 * sd).all(-1)
+        assert error[near].std() == pytest.approx(sd, rel=0.05)
+        both = near[:, 1:] & near[:, :-1]
+        assert np.corrcoef(error[:, 1:][both].ravel(), error[:, :-1][both].ravel())[0, 1] == pytest.approx(
+            0.7, abs=0.05
+        )
+        # an outlier has both components from N(0, 30 px): beyond 60 px with probability exp(−2)
+        far = np.linalg.norm(error, axis=-1) > 60
+        assert far.mean() == pytest.approx(0.05 * np.exp(-2), rel=0.1)
+
+
+def test_individuals_have_bodies_of_their_own_in_the_same_motion(scenes):
+    equal, own = (
+        scenes.windows_of(toy_bird(), (3, 1), 2, 4, scenes._gaussian_errors, draw)
+        for draw in (scenes._mean_body, scenes._individual)
+    )
+    np.testing.assert_array_equal(own.poses.poses.global_orient, equal.poses.poses.global_orient)
+    np.testing.assert_array_equal(own.poses.poses.scale, equal.poses.poses.scale)
+    np.testing.assert_array_equal(equal.poses.poses.bone_length, 1)
+    bones = own.poses.poses.bone_length
+    assert (bones == bones[:, :1]).all()
+    assert 0.01 < (bones[0, 0] - bones[1, 0]).std() < 0.2
+    assert np.abs(own.poses.poses.betas).min() > 0
 
 
 def _line(worlds, name, factor):
@@ -137,7 +196,7 @@ def test_stored_runs_are_not_repeated(worlds, tmp_path, monkeypatch, capsys):
         return [{"part": "", "sums": sums, "seconds": 1.0, "missing": 0}]
 
     monkeypatch.setattr(worlds, "run", run)
-    monkeypatch.setattr(worlds, "WORLDS", {1: worlds.WORLDS[1]._replace(draw=lambda seed, quick: ["scene"])})
+    monkeypatch.setattr(worlds, "WORLDS", {1: worlds.WORLDS[1]._replace(draw=lambda seed, quick, equal: ["scene"])})
     path = tmp_path / "runs.json"
     paper, fast = worlds.read_named_config("paper"), worlds.read_named_config("fast")
     worlds.compare([paper], [1], [200], False, path)

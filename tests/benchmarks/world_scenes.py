@@ -1,4 +1,4 @@
-"""The six worlds of `worlds.py`: observations of birds, and the truth about these birds.
+"""The worlds of `worlds.py`: observations of birds, and the truth about these birds.
 
 1. `murres`: murres on a ledge with simulated detections (`jaxfit.simulation.noise`).
 2. `murre_pixels`: murres from pixels. The built-in networks detect and track the birds in simulated footage.
@@ -9,8 +9,16 @@
 5. `cub`: photographs of five species (CUB-200-2011), without 3D truth.
 6. `avian_windows`: windows of the avian-mesh model with 12 keypoints. Keypoints have heavy-tailed errors that differ
    between keypoints and are correlated in time, and some keypoints are missing.
+7. `aves_individuals`: windows of the AVES model whose birds have bones and shapes from the priors of AVES. Errors of
+   the keypoints are correlated in time and larger in fast motion, 5 % are outliers of 30 px, and masks are 0.44 px too
+   large.
 
-In worlds 3, 4 and 6, every bird has an image of its own, so that no bird hides another bird.
+Birds are individuals: in worlds 1, 2, 3 and 6 their bones differ by 5 % from those of the model, in world 3 also their
+shapes, and in world 1 the keypoints of the detector lie beside those of the model. With `equal`, all birds of these
+worlds have the body of the model, in the same motion. World 4 draws species, world 5 is real, and world 7 is without
+this choice.
+
+In worlds 3, 4, 6 and 7, every bird has an image of its own, so that no bird hides another bird.
 """
 
 from __future__ import annotations
@@ -21,6 +29,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -31,7 +40,7 @@ from speed import NOISE_PX, OUTLIERS
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.data.formats import FOOTAGE
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.data.masks import box_of_mask, encode_mask
+from jaxfit.data.masks import box_of_mask, decode_mask, encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.initial_poses import InitialPoses, load_initial_poses
@@ -39,11 +48,21 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CropCamera, project, to_screen
 from jaxfit.model.files import load_murre
-from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_keypoints, posed_vertices
+from jaxfit.model.kinematics import (
+    Pose,
+    Rig,
+    fold_bird,
+    joint_transforms,
+    posed_keypoints,
+    posed_vertices,
+    window_transforms,
+    window_vertices,
+)
 from jaxfit.model.published import import_model
 from jaxfit.perception.track import track_video
 from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.individuals import draw_bones, draw_bones_of_prior, draw_offsets, draw_shape
 from jaxfit.simulation.noise import detect
 from jaxfit.simulation.scene import simulate, stage_scene
 from jaxfit.simulation.species import random_pose, random_species
@@ -76,8 +95,8 @@ class World(NamedTuple):
     """A world: a name and a function that draws its scenes."""
 
     name: str
-    draw: Callable[[int, bool], list[Scene]]
-    """From a seed, and whether the scenes are small, to the scenes."""
+    draw: Callable[[int, bool, bool], list[Scene]]
+    """From a seed, whether the scenes are small, and whether the birds have equal bodies, to the scenes."""
     reference: str
     """The config that no other config may be worse than."""
     pictures: bool = False
@@ -88,18 +107,23 @@ class World(NamedTuple):
     """Whether the scenes differ between seeds."""
 
 
-def murres(seed: int, quick: bool) -> list[Scene]:
+def bodies(equal: bool) -> dict[str, float]:
+    """Return the arguments of a simulated scene for individuals, or for equal bodies."""
+    return {"bone_sd": 0.0, "keypoint_offset": 0.0} if equal else {}
+
+
+def murres(seed: int, quick: bool, equal: bool) -> list[Scene]:
     """Draw a scene of murres with simulated detections."""
     bird = load_murre()
-    scene = stage_scene(bird, *((3, 20) if quick else (5, 60)), seed=seed)
+    scene = stage_scene(bird, *((3, 20) if quick else (5, 60)), seed=seed, **bodies(equal))
     return [Scene(bird, scene.detections, scene.truth, scene.poses)]
 
 
-def murre_pixels(seed: int, quick: bool) -> list[Scene]:
+def murre_pixels(seed: int, quick: bool, equal: bool) -> list[Scene]:
     """Draw a scene of murres, film the scene, and track the birds in the footage with the built-in networks."""
     bird = load_murre()
     with tempfile.TemporaryDirectory() as folder:
-        scene = simulate(bird, Path(folder) / "scene", *((3, 20) if quick else (5, 60)), seed=seed)
+        scene = simulate(bird, Path(folder) / "scene", *((3, 20) if quick else (5, 60)), seed=seed, **bodies(equal))
         tracks = track_video(Path(folder) / "scene" / FOOTAGE, load_reconstruct_config().track)
     return [Scene(bird, tracks, scene.truth, scene.poses)]
 
@@ -118,15 +142,45 @@ def published(kind: str, folder: str) -> Bird:
     return import_model(kind, [reference / "models" / folder])
 
 
-def aves_windows(seed: int, quick: bool) -> list[Scene]:
+def aves_windows(seed: int, quick: bool, equal: bool) -> list[Scene]:
     """Draw windows of the AVES model; keypoints have Gaussian errors of 2 px, and 5 % are outliers."""
-    return [windows_of(published("aves", "aves"), (3, seed), *((2, 20) if quick else (3, 100)), _gaussian_errors)]
+    bird = published("aves", "aves")
+    return [windows_of(bird, (3, seed), *_window_size(quick), _gaussian_errors, _mean_body if equal else _individual)]
 
 
-def avian_windows(seed: int, quick: bool) -> list[Scene]:
+def avian_windows(seed: int, quick: bool, equal: bool) -> list[Scene]:
     """Draw windows of the avian-mesh model with 12 keypoints, of which some are missing."""
     bird = published("avian-mesh", "avian_mesh")
-    return [windows_of(bird, (6, seed), *((2, 20) if quick else (3, 100)), _heavy_errors)]
+    return [windows_of(bird, (6, seed), *_window_size(quick), _heavy_errors, _mean_body if equal else _individual)]
+
+
+def aves_individuals(seed: int, quick: bool, _equal: bool) -> list[Scene]:
+    """Draw windows of individuals from the priors of AVES, with correlated errors and masks that are too large."""
+    bird = published("aves", "aves")
+    return [windows_of(bird, (7, seed), *_window_size(quick), _correlated_errors, _of_prior, GROWN_PX)]
+
+
+def _window_size(quick: bool) -> tuple[int, int]:
+    """Return the number of birds and of frames."""
+    return (2, 20) if quick else (3, 100)
+
+
+DrawBody = Callable[[Bird, np.random.Generator], tuple[np.ndarray, np.ndarray]]
+"""Draws the bone lengths and the shape coefficients of an individual."""
+
+
+def _mean_body(bird: Bird, _rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(bird.bone_mean), np.zeros(bird.num_shapes, np.float32)
+
+
+def _individual(bird: Bird, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw bones that differ by 5 %, and a shape from the shape space."""
+    return draw_bones(bird, rng), draw_shape(bird, rng)
+
+
+def _of_prior(bird: Bird, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw bones and shape from the priors of the model."""
+    return draw_bones_of_prior(bird, rng), draw_shape(bird, rng)
 
 
 def windows_of(
@@ -135,8 +189,10 @@ def windows_of(
     birds: int,
     frames: int,
     errors: Callable[[np.random.Generator, Observations], Observations],
+    draw_body: DrawBody = _mean_body,
+    grown_px: float = 0.0,
 ) -> Scene:
-    """Draw smooth random motion of some birds, each in images of its own, with exact masks.
+    """Draw smooth random motion of some birds, each in images of its own; the masks of the truth are exact.
 
     Args:
         bird: the model.
@@ -144,8 +200,13 @@ def windows_of(
         birds: number of birds.
         frames: number of frames.
         errors: from exact observations to observations with errors of the keypoints.
+        draw_body: the bodies of the birds; the motion does not depend on it.
+        grown_px: masks include all pixels whose centre is at most this far outside the bird.
     """
     poses = [smooth_motion(bird, frames, int(motion)) for motion in np.random.SeedSequence(seed).generate_state(birds)]
+    rng = np.random.default_rng((*seed, 11))
+    for n, (bone_length, betas) in enumerate(draw_body(bird, rng) for _ in range(birds)):
+        poses[n] = replace(poses[n], bone_length=bone_length, betas=betas)
     exact = detect(bird, poses, camera=WIDE)
     own_images = {(n, t): (f"bird_{n}/{t:06d}.png", *exact.image_size(n, t)) for n, t in exact.masks}
     exact = replace(exact, own_images=own_images, amodal_masks=exact.masks)
@@ -160,8 +221,46 @@ def windows_of(
         bone_length=each_frame(stacked.bone_length),
         betas=each_frame(stacked.betas),
     )
-    observations = errors(np.random.default_rng((*seed, 8)), exact)
+    observations = replace(errors(np.random.default_rng((*seed, 8)), exact), amodal_masks={})
+    if grown_px:
+        rig, faces, masks = fold_bird(bird), np.asarray(bird.faces), {}
+        for n, pose in enumerate(poses):
+            screens = np.asarray(to_screen(window_vertices(rig, window_transforms(rig, pose), pose), WIDE))
+            masks |= {
+                (n, t): encode_mask(grown_mask(screen, faces, WIDE.size_px, grown_px))
+                for t, screen in enumerate(screens)
+            }
+        boxes = [[box_of_mask(decode_mask(masks[n, t])) for t in range(frames)] for n in range(birds)]
+        observations = replace(observations, masks=masks, box_px=np.float32(boxes))
     return Scene(bird, observations, exact, true_solution(bird, stacked, exact, WIDE))
+
+
+FINE = 5
+"""Samples of a pixel, in x and y, for masks that are larger than the bird; the middle sample is the centre."""
+
+
+def grown_mask(screen: Float[np.ndarray, "V 3"], faces: np.ndarray, size_px: int, grown_px: float) -> np.ndarray:
+    """Return the pixels whose centre lies inside the projection of a mesh, or at most `grown_px` outside.
+
+    Args:
+        screen: x and y in pixels, and depth.
+        faces: faces of the mesh.
+        size_px: width and height of the picture.
+        grown_px: distance in pixels; distances are precise to about a fifth of a pixel.
+    """
+    margin = int(np.ceil(grown_px)) + 1
+    (x, y), (right, bottom) = (
+        np.clip(side.astype(int), 0, size_px)
+        for side in (screen[:, :2].min(0) - margin, screen[:, :2].max(0) + margin + 1)
+    )
+    width, height = right - x, bottom - y
+    moved = np.float32((screen - [x, y, 0]) * [FINE, FINE, 1])
+    fine = hard_mask(moved, faces, int(FINE * width), int(FINE * height))
+    # the border of the bird lies half a sample outside the outermost sample, on average
+    distance = cv2.distanceTransform((~fine).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    mask, middle = np.zeros((size_px, size_px), bool), slice(FINE // 2, None, FINE)
+    mask[y:bottom, x:right] = distance[middle, middle] <= FINE * grown_px + 0.5
+    return mask
 
 
 def true_solution(bird: Bird, pose: Pose, exact: Observations, camera: CropCamera) -> Solution:
@@ -210,7 +309,7 @@ def _gaussian_errors(rng: np.random.Generator, exact: Observations) -> Observati
     is_outlier = rng.random(exact.confidence.shape) < OUTLIERS
     low, size = exact.box_px[..., None, :2], exact.box_px[..., None, 2:]
     points = np.where(is_outlier[..., None], low + size * rng.uniform(-0.2, 1.2, points.shape), points)
-    return replace(exact.with_keypoints(points, exact.confidence), amodal_masks={})
+    return exact.with_keypoints(points, exact.confidence)
 
 
 MISSING, RHO, DOF = 0.15, 0.7, 3.0
@@ -233,18 +332,39 @@ def _heavy_errors(rng: np.random.Generator, exact: Observations) -> Observations
     ratio = np.linalg.norm(error, axis=-1) / 3.0
     confidence = 1 / (1 + np.exp(-(2.0 - ratio + 0.7 * rng.standard_normal(ratio.shape))))
     confidence = np.where(runs < MISSING, 0.0, confidence)
-    return replace(exact.with_keypoints(exact.keypoints_px + error, confidence), amodal_masks={})
+    return exact.with_keypoints(exact.keypoints_px + error, confidence)
 
 
-OFFSET = (0.01, 0.03)
-"""Range of the distance between an annotator's keypoint and that of the model, as a share of the body length."""
+ERROR_PX, MOTION, AR1, OUTLIER_PX, GROWN_PX = 3.0, 0.15, 0.7, 30.0, 0.44
+"""World 7: standard deviation of an error of a keypoint at rest (pixels), its increase per pixel of motion per frame,
+its correlation between consecutive frames, standard deviation of an outlier, and what masks are too large (pixels)."""
+
+
+def _correlated_errors(rng: np.random.Generator, exact: Observations) -> Observations:
+    """Add errors of the keypoints, which are correlated in time and larger in fast motion, and enlarge the masks.
+
+    The errors of x and y are σ · z with σ² = ERROR_PX² + (MOTION · displacement to the next frame)². z has unit
+    variance and is AR(1): z_t = ρ z_{t−1} + √(1 − ρ²) w_t with ρ = 0.7. Outliers are independent between frames. All
+    confidences are 1.
+    """
+    points = exact.keypoints_px.astype(np.float64)
+    z = rng.standard_normal(points.shape)
+    for t in range(1, points.shape[1]):
+        z[:, t] = AR1 * z[:, t - 1] + np.sqrt(1 - AR1**2) * z[:, t]
+    moved = np.linalg.norm(np.diff(points, axis=1, append=points[:, -1:]), axis=-1, keepdims=True)
+    error = np.hypot(ERROR_PX, MOTION * moved) * z
+    is_outlier = rng.random(exact.confidence.shape) < OUTLIERS
+    error = np.where(is_outlier[..., None], OUTLIER_PX * rng.standard_normal(points.shape), error)
+    return exact.with_keypoints(points + error, exact.confidence)
+
+
 PICTURE_NOISE_PX = 1.5
 """Standard deviation of the annotator's errors in x and y, pixels of a 256-pixel picture."""
 KEYPOINTS = (12, 18)
 """Fewest and most annotated keypoints of a picture."""
 
 
-def species(seed: int, quick: bool) -> list[Scene]:
+def species(seed: int, quick: bool, _equal: bool) -> list[Scene]:
     """Draw pictures of 20 random species: half of the pictures have masks.
 
     A track is a species, and its frames are pictures of different individuals in different poses from random
@@ -278,7 +398,7 @@ def pictures_of(bird: Bird, seed: int, numbers: Sequence[int], pictures: int, st
     masks, boxes = {}, np.zeros((N, T, 4), np.float32)
     for n, number in enumerate(numbers):
         member = random_species(bird, 1000 * seed + number)
-        betas, offsets = _shape_of(member, bird), _annotator_offsets(bird, np.random.default_rng((seed, number, 9)))
+        betas, offsets = _shape_of(member, bird), draw_offsets(bird, np.random.default_rng((seed, number, 9)))
         rng = np.random.default_rng((seed, number, 10 + stream))
         for t in range(T):
             pose = random_pose(member, rng)
@@ -327,22 +447,7 @@ def _shape_of(member: Bird, bird: Bird) -> Float[np.ndarray, "S"]:
     return np.linalg.lstsq(basis.T, change.ravel(), rcond=None)[0]
 
 
-def _annotator_offsets(bird: Bird, rng: np.random.Generator) -> Float[np.ndarray, "K 3"]:
-    """Draw the constant offsets of an annotator's keypoints, in the rest pose: the same on both sides of the bird."""
-    rest = np.asarray(bird.keypoints, np.float64)
-    names = bird.keypoint_names
-    length = np.linalg.norm(rest[names.index("bill_tip")] - rest[names.index("tail_tip")])
-    direction = rng.standard_normal(rest.shape)
-    paired = {k for pair in bird.keypoint_pairs for k in pair}
-    direction[[k for k in range(len(rest)) if k not in paired], 0] = 0  # x is lateral
-    offsets = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    offsets *= length * rng.uniform(*OFFSET, (len(rest), 1))
-    for left, right in bird.keypoint_pairs:
-        offsets[right] = offsets[left] * [-1, 1, 1]
-    return offsets
-
-
-def cub(seed: int, quick: bool) -> list[Scene]:
+def cub(seed: int, quick: bool, _equal: bool) -> list[Scene]:
     """Read the photographs of five species, with the initial poses of a pose regressor; the seed has no effect."""
     bird, scenes = published("aves", "aves"), []
     for path in sorted((reference_folder() / "cub").glob("*.json"))[: 1 if quick else None]:
@@ -361,5 +466,6 @@ WORLDS = {
     4: World("random species, single pictures", species, "aves", pictures=True, birds="species"),
     5: World("photographs of five species (CUB)", cub, "aves", pictures=True, seeds=False),
     6: World("windows of avian-mesh, 12 keypoints", avian_windows, "paper"),
+    7: World("windows of AVES, individuals", aves_individuals, "paper"),
 }
 """The worlds by number."""

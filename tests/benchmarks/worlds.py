@@ -1,4 +1,4 @@
-"""Compare configs of the fit on six worlds with known truth, with intervals and paired ratios over birds.
+"""Compare configs of the fit on seven worlds with known truth, with intervals and paired ratios over birds.
 
 A world is a kind of data (`world_scenes.py`). No number of a shipped config may be chosen on one world alone, and no
 shipped config may be significantly worse than `paper` (windows) or `aves` (pictures) in me_p, aligned 3D error or IoU
@@ -317,7 +317,12 @@ def report(number: int, configs: Mapping[str, Mapping[str, Sequence[Mapping[str,
 
 
 def compare(
-    configs: Sequence[Config], worlds: Sequence[int], seeds: Sequence[int], quick: bool, path: Path | None
+    configs: Sequence[Config],
+    worlds: Sequence[int],
+    seeds: Sequence[int],
+    quick: bool,
+    path: Path | None,
+    equal: bool = False,
 ) -> None:
     """Fit and measure all runs that the file does not hold, store them, and print the report of every world."""
     stored = json.loads(path.read_text()) if path and path.exists() else {}
@@ -327,9 +332,10 @@ def compare(
         for seed in seeds if world.seeds else ["all"]:
             scenes: list[Scene] = []
             for config in configs:
-                key = f"world {number}, seed {seed}, {config.key}, code {code}{', quick' if quick else ''}"
+                key = f"world {number}, seed {seed}, {config.key}, code {code}"
+                key += f"{', quick' if quick else ''}{', equal' if equal else ''}"
                 if key not in stored:
-                    scenes = scenes or world.draw(int(seed) if world.seeds else 0, quick)
+                    scenes = scenes or world.draw(int(seed) if world.seeds else 0, quick, equal)
                     stored[key] = run(scenes, config, world.pictures, compiled)
                     if path:
                         write_whole(path, json.dumps(stored).encode())
@@ -357,6 +363,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--worlds", nargs="+", type=int, default=list(WORLDS), choices=list(WORLDS))
     parser.add_argument("--seeds", nargs="+", type=int, required=True)
     parser.add_argument("--out", type=Path, help="JSON file of the runs; runs that it holds are not repeated")
+    parser.add_argument("--equal", action="store_true", help="birds with the body of the model, where that is possible")
     parser.add_argument("--quick", action="store_true", help="small scenes, to try the command")
     options = parser.parse_args(arguments)
     try:
@@ -365,7 +372,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if reminder:
             sys.stdout.write(f"NOTE: {reminder}\n")
         use_cache()
-        compare(configs, options.worlds, options.seeds, options.quick, options.out)
+        compare(configs, options.worlds, options.seeds, options.quick, options.out, options.equal)
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
