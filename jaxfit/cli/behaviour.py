@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfit.cli.results import frame_range, track_ids
-from jaxfit.cli.tables import counted, right_aligned, show
+from jaxfit.cli.tables import right_aligned, show
+from jaxfit.foundation.errors import counted
 from jaxfit.foundation.progress import terminal
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxfit.cli.tables import counted, right_aligned, show
-from jaxfit.foundation.errors import InputError
+from jaxfit.cli.tables import right_aligned, show
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.files import check_new_file
 from jaxfit.foundation.progress import ReportProgress, terminal
 

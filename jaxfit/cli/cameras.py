@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxfit.cli.observations import observations_for
-from jaxfit.cli.tables import counted, right_aligned, show
-from jaxfit.foundation.errors import InputError
+from jaxfit.cli.tables import right_aligned, show
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.files import check_new_file
 from jaxfit.foundation.progress import terminal
 from jaxfit.model.files import find_bird

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from jaxfit.behaviour.result import behaviour_of_result
 from jaxfit.cli.observations import matching_line, observation_tables, parsed_size
-from jaxfit.cli.tables import counted, evaluation_tables, flag_quality_line, show, track_table
+from jaxfit.cli.tables import evaluation_tables, flag_quality_line, show, track_table
 from jaxfit.config.build import with_values
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.data.formats import FOOTAGE, MARKER
@@ -21,7 +21,7 @@ from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.evaluation.tracking import ObservationsEvaluation, evaluate_observations
 from jaxfit.evaluation.truth import Matching, Truth, match_tracks
 from jaxfit.export.export import export_result
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.files import check_replaceable, check_writable, remove_leftovers, write_whole
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text

@@ -10,8 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxfit.cli.tables import EscapedTable, counted, show
-from jaxfit.foundation.errors import InputError
+from jaxfit.cli.tables import EscapedTable, show
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.extras import (
     DISTRIBUTION,
     OPTIONAL_PACKAGES,

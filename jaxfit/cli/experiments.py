@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import time
 
-from jaxfit.cli.tables import counted, show
+from jaxfit.cli.tables import show
+from jaxfit.foundation.errors import counted
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.progress import terminal
 from jaxfit.model.files import find_bird

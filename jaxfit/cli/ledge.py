@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from jaxfit.cli.tables import counted, right_aligned, show
-from jaxfit.foundation.errors import InputError
+from jaxfit.cli.tables import right_aligned, show
+from jaxfit.foundation.errors import InputError, counted
 
 if TYPE_CHECKING:
     from jaxfit.cameras.camera import Camera

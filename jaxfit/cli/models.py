@@ -6,8 +6,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from jaxfit.cli.tables import counted, right_aligned, show, show_facts
-from jaxfit.foundation.errors import InputError
+from jaxfit.cli.tables import right_aligned, show, show_facts
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.reading import json_text
 from jaxfit.model.files import find_bird, read_provenance, save_bird
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from jaxfit.cli.tables import EscapedTable, counted, right_aligned, show, show_facts, track_table
+from jaxfit.cli.tables import EscapedTable, right_aligned, show, show_facts, track_table
 from jaxfit.config.yaml_file import read_yaml_file
 from jaxfit.data.formats.coco_records import Untracked
 from jaxfit.data.keypoint_names import NameMap, checked_map, map_keypoints, propose_names
 from jaxfit.data.observations import Observations
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import terminal
 
 if TYPE_CHECKING:

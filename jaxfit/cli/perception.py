@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxfit.cli.observations import show_names
-from jaxfit.cli.tables import counted, flag_line, right_aligned, show, track_table
+from jaxfit.cli.tables import flag_line, right_aligned, show, track_table
+from jaxfit.foundation.errors import counted
 from jaxfit.foundation.progress import terminal
 from jaxfit.model.files import find_bird
 

@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 
-from jaxfit.cli.tables import counted, right_aligned, show, track_table
-from jaxfit.foundation.errors import InputError
+from jaxfit.cli.tables import right_aligned, show, track_table
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import terminal
 from jaxfit.review.edits import EXAMPLES, Edit, parse_edit, read_edits
 

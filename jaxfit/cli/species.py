@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxfit.cli.tables import counted, right_aligned, show
-from jaxfit.foundation.errors import InputError
+from jaxfit.cli.tables import right_aligned, show
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.files import check_writable
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text

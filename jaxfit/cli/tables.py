@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxfit.data.tracks import track_quality
-from jaxfit.foundation.errors import one_line
+from jaxfit.foundation.errors import counted, one_line
 
 if TYPE_CHECKING:
     from jaxfit.data.observations import Observations
@@ -39,11 +39,6 @@ def show(output: Table | str) -> None:
         output = "\n".join(one_line(line) for line in output.split("\n"))
     is_text = isinstance(output, str)
     Console(soft_wrap=is_text, highlight=False, markup=False, emoji=False).print(output)
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a count with its noun: `1 bird`, `2 birds`."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 class EscapedTable(Table):

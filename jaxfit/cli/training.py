@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxfit.cli.observations import image_size, keypoint_map
-from jaxfit.cli.tables import EscapedTable, counted, right_aligned, show, show_facts
+from jaxfit.cli.tables import EscapedTable, right_aligned, show, show_facts
 from jaxfit.config.yaml_file import rounded
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.files import check_new_file
 from jaxfit.foundation.progress import terminal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import json
@@ -187,19 +188,25 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     """
     plain = plain_config(config)
     references = {path: value[1:] for path, value in values.items() if isinstance(value, str) and value[:1] == "="}
-    for path in references:
-        target = references[path]
-        for _ in references:
-            target = references.get(target, target)
-        if target in references:
-            raise ConfigKeyError(path, "refers to itself", "give one of the values")
-        references[path] = target
-    for path in sorted(values, key=lambda path: path in references):  # references last
-        value = _get(plain, references[path], path) if path in references else values[path]
+
+    def set_value(path: str, value: Any) -> None:
         parent, key, is_term = _locate(plain, path, path)
         if is_term and isinstance(parent.get(key), dict) and not isinstance(value, dict):
             parent, key = parent[key], "weight"  # a term with settings
         parent[key] = value
+
+    for path, value in values.items():
+        if path not in references:
+            set_value(path, value)
+    path_at = {_place(plain, path, path): path for path in references}
+    for path, target in references.items():
+        followed = {path}
+        while (following := path_at.get(_place(plain, target, path))) is not None:
+            if following in followed:
+                raise ConfigKeyError(path, "refers to itself", "give one of the values")
+            followed.add(following)
+            target = references[following]
+        set_value(path, _get(plain, target, path))
     return build_config(type(config), plain)
 
 
@@ -230,14 +237,16 @@ def _get(plain: Any, path: str, requested: str) -> Any:
     return value.get("weight", 1.0) if is_term and isinstance(value, dict) else value
 
 
-def _locate(plain: Any, path: str, requested: str) -> tuple[Any, Any, bool]:
+def _locate(plain: Any, path: str, requested: str, passed: list[Any] | None = None) -> tuple[Any, Any, bool]:
     """Return the mapping or list that holds the last part of a path, that part, and whether the part names a term.
 
     Args:
         plain: the config as plain values.
         path: the path to follow; a term's name may contain dots.
         requested: the path to name in errors; differs from `path` for a reference (``=path``).
+        passed: receives the keys before the last key.
     """
+    passed = [] if passed is None else passed
     parent: Any = plain
     rest, is_term = re.sub(r"\[(\d+)\]", r".\1", path), False
     while True:
@@ -254,7 +263,15 @@ def _locate(plain: Any, path: str, requested: str) -> tuple[Any, Any, bool]:
             detail = "" if path == requested else f"`{path}`: "
             known = known_names(key, parent) if isinstance(parent, dict) else ""
             raise ConfigKeyError(requested, f"is an unknown path: {detail}there is no `{key}`", known)
+        passed.append(key)
         parent, is_term = value, key in ("terms", "override") and isinstance(value, dict)
+
+
+def _place(plain: Any, path: str, requested: str) -> tuple[Any, ...]:
+    """Return the keys of a path in one spelling: stages by their numbers, and a term by its weight."""
+    keys: list[Any] = []
+    _, key, is_term = _locate(copy.deepcopy(plain), path, requested, keys)
+    return (*keys, key, *(["weight"] if is_term else []))
 
 
 def _first_key(parent: Any, path: str) -> tuple[str, str]:
@@ -270,6 +287,8 @@ def _first_key(parent: Any, path: str) -> tuple[str, str]:
 def _stage_index(stages: list[Any], key: str, requested: str) -> int:
     names = [stage.get("name") for stage in stages if isinstance(stage, dict)]
     if key in names:
+        if names.count(key) > 1:
+            raise ConfigKeyError(requested, f"names {names.count(key)} stages", "name a stage by its number, from 0")
         return names.index(key)
     numbers = list(map(str, range(len(stages))))
     if key in numbers:

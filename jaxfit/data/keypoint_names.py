@@ -32,13 +32,13 @@ _SYNONYMS_OF = {
     "tip": "end point",
     "base": "root start",
     "middle": "mid centre center",
-    "": "joint of the",
+    "": "of the",
 }
 """Word → the words that it replaces; the empty word does not count."""
 _SYNONYMS = {synonym: word for word, synonyms in _SYNONYMS_OF.items() for synonym in synonyms.split()}
 _PLAIN_WORDS = """
 left right bill tip base tail wing head neck eye foot shin wrist back throat breast crown nape forehead top front upper
-lower middle
+lower middle joint
 """
 _WORDS = {*_SYNONYMS, *_PLAIN_WORDS.split()}
 """Words that a name without separators is split into, such as `tailbase`."""
@@ -53,7 +53,8 @@ _ALIASES: Mapping[str, tuple[str, ...]] = {
     "tail_base": ("tailbase",),
     "tail_tip": ("tail",),
     "wingtip": ("wing",),
-    "wrist": ("wing wrist",),
+    "wrist": ("wing wrist", "joint wrist"),
+    "shin": ("joint shin",),
 }
 """Keypoint of a model, without its side → other names for it, as sorted words; earlier names are preferred."""
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")

@@ -216,21 +216,16 @@ def without_mask_stages(config: FitConfig) -> FitConfig:
     A config that has no other stages keeps its stages, without the terms that compare masks. If no term is left, the
     config is returned unchanged.
     """
-    if all(map(needs_mask, config.stages)):
-        stages = []
-        for stage in config.stages:
-            others = tuple(name for name, term in find_terms(stage.terms).items() if not term.compares_masks)
-            if others:
-                stages.append(replace(stage, terms=others))
-        return replace(config, stages=tuple(stages) or config.stages)
+    only_masks = all(map(needs_mask, config.stages))
     kept: list[StageConfig] = []
     for stage in config.stages:
-        if kept and needs_mask(stage):
+        others = tuple(name for name, term in find_terms(stage.terms).items() if not term.compares_masks)
+        carry = stage.carry_moments and bool(kept) and kept[-1].solver == "adam"
+        if kept and needs_mask(stage) and not only_masks:
             kept.append(_continuation(kept[-1], stage))
-        elif not needs_mask(stage):
-            carry = stage.carry_moments and bool(kept) and kept[-1].solver == "adam"
-            kept.append(replace(stage, carry_moments=carry))
-    return replace(config, stages=tuple(kept))
+        elif others and (only_masks or not needs_mask(stage)):
+            kept.append(replace(stage, terms=others, carry_moments=carry))
+    return replace(config, stages=tuple(kept)) if kept else config
 
 
 def _continuation(before: StageConfig, stage: StageConfig) -> StageConfig:

@@ -39,6 +39,11 @@ def one_line(text: object) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun: `1 bird`, `2,000 birds`."""
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
 def shortened(text: str, longest: int) -> str:
     """Return a text of at most `longest` characters; a longer text loses characters in its middle."""
     if len(text) <= longest:

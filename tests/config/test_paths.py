@@ -63,6 +63,32 @@ def test_a_reference_to_a_reference_has_the_new_value():
         with_values(PAPER, chain | {"terms.pose_prior": "=terms.acceleration"})
 
 
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize(
+    "chain",
+    [
+        {"window": "=stages[0].steps", "stages.keypoints.steps": "=stages.1.steps", "stages.mask.steps": 40},
+        {"terms.velocity": "=terms.keypoints.weight", "terms.keypoints": "=terms.mask", "terms.mask": 40},
+        {"terms.velocity": "=terms.mask", "terms.mask.weight": "=stages.mask.steps", "stages[1].steps": 40},
+    ],
+)
+def test_a_reference_to_a_reference_in_another_spelling(chain, order):
+    changed = with_values(PAPER, dict(list(chain.items())[::order]))
+    assert {get_value(changed, path) for path in chain} == {40}
+
+
+def test_a_reference_to_itself_in_another_spelling():
+    with pytest.raises(ConfigKeyError, match=r"`stages\[0\].steps` refers to itself"):
+        with_values(PAPER, {"stages[0].steps": "=stages.keypoints.steps"})
+
+
+def test_a_name_of_two_stages():
+    twice = dataclasses.replace(PAPER, stages=(PAPER.stages[0], PAPER.stages[0]))
+    with pytest.raises(ConfigKeyError, match=r"`stages.keypoints.steps` names 2 stages \(name a stage by its number"):
+        with_values(twice, {"stages.keypoints.steps": 3})
+    assert with_values(twice, {"stages[1].steps": 3}).stages[1].steps == 3
+
+
 def test_the_value_of_a_term_is_its_weight():
     assert get_value(PAPER, "terms.keypoints") == 1
     assert get_value(PAPER, "terms.keypoints.sigma_px") == 50

@@ -23,7 +23,7 @@ SPELLINGS = {
     "left_wingtip": "wingL left_wing leftwingtip LWingTip wing_tip_left",
     "right_wrist": "RWrist carpal_r right_carpal_joint rightWrist",
     "right_foot": "footR rightfoot right_toes",
-    "left_shin": "left_tarsus ankleL lshin",
+    "left_shin": "left_tarsus ankleL lshin left_ankle_joint",
 }
 PAIRS = [(name, model) for model, names in SPELLINGS.items() for name in names.split()]
 
@@ -35,8 +35,9 @@ def test_spellings():
 
 def test_unknown_names_are_not_mapped():
     others = ["snout", "leftear", "eye", "wing", "forelegL4", "belly", "left_leg", "ear_r", "x"]
-    middles = ["tail_mid", "mid_wing_left"]
-    names = propose_names([*others, *middles], MURRE_KEYPOINTS)
+    middles = ["tail_mid", "mid_wing_left", "tail_center", "wing_midpoint_left", "head_centre"]
+    joints = ["wing_joint_left", "LWingJoint", "tail_joint", "bill_joint", "neck_joint"]
+    names = propose_names([*others, *middles, *joints], MURRE_KEYPOINTS)
     assert not names.mapped
     assert names.missing == MURRE_KEYPOINTS
 

@@ -104,6 +104,17 @@ def test_a_config_with_mask_stages_only_loses_the_mask_terms():
     assert [stage.terms for stage in staged(stage, mask)] == [("keypoints", "pose_prior")]
 
 
+def test_moments_do_not_pass_over_a_stage_that_is_left_out():
+    first = StageConfig("first", 3, ("keypoints", "mask"), solver="levenberg_marquardt")
+    mask = StageConfig("mask", 3, ("mask",))
+    last = StageConfig("last", 3, ("keypoints", "mask"), carry_moments=True)
+    assert [(stage.name, stage.carry_moments) for stage in staged(first, mask, last)] == [
+        ("first", False),
+        ("last", False),
+    ]
+    assert [stage.carry_moments for stage in staged(mask, last)] == [False]
+
+
 def test_a_config_that_compares_masks_only_is_refused():
     some = dataclasses.replace(config(), stages=(StageConfig("outline", 1, ("mask",)),))
     with pytest.raises(InputError, match="birds: holds no masks, but every term of the config compares masks"):

@@ -27,6 +27,7 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import rest_length
+from jaxfit.view.report.axis import clock, duration
 from jaxfit.view.report.contents import gather, next_steps, warnings_of
 from jaxfit.view.report.curves import line_path, scale_of
 from jaxfit.view.report.page import Measured, page, spread_frames
@@ -456,3 +457,14 @@ def test_descriptions_become_sections():
         "No curve of distance of the nearest neighbour: the result has one bird.",
         "The result cannot show bow: the model has no bill.",
     ]
+
+
+def test_times_are_rounded_before_they_are_divided():
+    assert [clock(frame / 240) for frame in (0, 14399, 28798, 863999)] == ["0.00 s", "1:00.00", "1:59.99", "1:00:00.00"]
+    assert [duration(seconds) for seconds in (59.94, 59.96, 3599.4, 3599.6)] == [
+        "59.9 s",
+        "1:00 min",
+        "59:59 min",
+        "1:00:00 h",
+    ]
+    assert clock(59.96, digits=1) == "1:00.0"

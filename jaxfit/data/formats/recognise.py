@@ -15,7 +15,7 @@ from jaxfit.data.formats.keypoint_table import KeypointTable, table_observations
 from jaxfit.data.formats.label_studio import read_label_studio
 from jaxfit.data.formats.sleap import read_sleap_analysis, read_sleap_project, read_with_sleap_io
 from jaxfit.data.observations import Observations
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.reading import open_file, reading
 
 _log = logging.getLogger(__name__)
@@ -78,16 +78,17 @@ def statement(observations: Observations, kind: str, path: Path) -> str:
     """
     N, T = observations.present.shape
     films = sorted({str(name).partition("#")[0] for name in observations.file_name})
-    of = films[0] if len(films) == 1 else f"{len(films)} pictures" if films else path.stem
+    of = films[0] if len(films) == 1 else counted(len(films), "picture") if films else path.stem
     of = "an unknown film" if of == path.stem else of
     width, height = observations.image_size_px[0].tolist() if T else (0, 0)
     numbers = observations.frame_index[[0, -1]].tolist() if T else []
-    frames = f"{T} frames ({numbers[0]} to {numbers[1]})" if T else "no frame"
-    count = f"{observations.photographs} photographs" if observations.photographs else frames
+    frames = f"{counted(T, 'frame')} ({numbers[0]} to {numbers[1]})" if T else "no frame"
+    count = counted(observations.photographs, "photograph") if observations.photographs else frames
     known, most = int((observations.confidence > 0).sum()), int(observations.present.sum()) * observations.num_keypoints
-    keypoints = f"{observations.num_keypoints} keypoints ({known:,} of {most:,} known)"
+    keypoints = f"{counted(observations.num_keypoints, 'keypoint')} ({known:,} of {most:,} known)"
     rate = "" if observations.fps is None else f" at {observations.fps:.5g} frames/s"
-    return f"{kind} of {of}, {width}×{height}{rate}: {N} birds, {count}, {keypoints}, {len(observations.masks)} masks"
+    held = f"{counted(N, 'bird')}, {count}, {keypoints}, {counted(len(observations.masks), 'mask')}"
+    return f"{kind} of {of}, {width}×{height}{rate}: {held}"
 
 
 def _keypoints(path: Path, start: bytes, video: Path | None) -> tuple[str, KeypointTable | None]:

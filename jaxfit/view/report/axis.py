@@ -82,7 +82,7 @@ def runs(chosen: Bool[np.ndarray, "C"]) -> list[tuple[int, int]]:
 
 def duration(seconds: float) -> str:
     """Return a duration as `2.4 s`, `3:05 min` or `1:02:03 h`."""
-    if seconds < 60:
+    if round(seconds, 1) < 60:
         return f"{seconds:.1f} s"
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)

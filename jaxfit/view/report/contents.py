@@ -16,7 +16,7 @@ from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.result_folder import SUMMARY
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.model.bird import Bird
 
 
@@ -360,11 +360,6 @@ def _export(report: Report, result: str) -> list[Step]:
         return []
     command = f"jaxfit export {result} --to csv --out positions.csv"
     return [Step("Export positions and angles for your statistics.", command)]
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a count with its noun: `1 bird`, `2,000 birds`."""
-    return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
 def numbers(values: Sequence[int | str]) -> str:

@@ -15,10 +15,11 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.data.flags import FLAGS
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
+from jaxfit.foundation.errors import counted
 from jaxfit.model.bird import Bird
 from jaxfit.view.overlay import overlay_pictures
 from jaxfit.view.report.axis import duration
-from jaxfit.view.report.contents import Report, Track, counted, next_steps, warnings_of
+from jaxfit.view.report.contents import Report, Track, next_steps, warnings_of
 from jaxfit.view.report.rendering import rendered
 from jaxfit.view.report.timeline import SmallCurve, error_curve, size_curve, timeline_of
 

@@ -9,10 +9,9 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from jaxfit.foundation.errors import one_line
+from jaxfit.foundation.errors import counted, one_line
 from jaxfit.view.colours import FLAG_COLOURS, behaviour_colour, css, ink_on, track_colour
 from jaxfit.view.report.axis import duration
-from jaxfit.view.report.contents import counted
 
 
 def rendered(template: str, **values: Any) -> Markup:
