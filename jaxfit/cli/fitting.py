@@ -337,11 +337,13 @@ def _evaluate_observations(options: argparse.Namespace) -> None:
 
 def overlay(options: argparse.Namespace) -> None:
     """Draw a result on its video, or on one frame of its video."""
+    from jaxfit.data.result_folder import check_is_of_video, read_summary
     from jaxfit.data.solution import load_solution
     from jaxfit.data.world import as_filmed
     from jaxfit.view.overlay import overlay, overlay_frame
 
     solution, bird = load_solution(options.result)
+    check_is_of_video(options.result, read_summary(options.result), "`jaxfit report` says how to draw photographs")
     solution, lens = as_filmed(options.result, solution, bird, options.camera)
     observations = None
     if options.observations:

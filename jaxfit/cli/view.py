@@ -19,6 +19,7 @@ from jaxfit.foundation.progress import terminal
 def view(options: argparse.Namespace) -> None:
     """Serve the page until Ctrl+C, or save the page."""
     from jaxfit.data.formats.recognise import read_observations
+    from jaxfit.data.result_folder import check_is_of_video, read_summary
     from jaxfit.export.result import open_result
     from jaxfit.video.reader import probe_video
     from jaxfit.view.overlay import check_belongs
@@ -38,6 +39,9 @@ def view(options: argparse.Namespace) -> None:
         show("without the film: --video shows it beside the birds")
     else:
         for each in results:
+            check_is_of_video(
+                each.folder, read_summary(each.folder), "leave out --video: the page shows the birds in 3D"
+            )
             check_belongs(each.solution, None, video, probe_video(video), options.force)
     if options.save is not None:
         saved = save_page(results, video, options.save, options.overwrite, terminal)

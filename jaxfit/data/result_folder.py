@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxfit.data.formats.fields import read_json
+from jaxfit.foundation.errors import InputError
 
 POSES = "poses.npz"
 """File that marks a result folder."""
@@ -22,6 +23,12 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     path = folder / SUMMARY
     return {key: each.value for key, each in read_json(path).entries()} if path.is_file() else {}
+
+
+def check_is_of_video(folder: Path, summary: Mapping[str, Any], remedy: str) -> None:
+    """Raise InputError with a remedy if a result holds photographs."""
+    if summary.get("photographs"):
+        raise InputError(folder, "holds photographs, which are not the frames of one video", remedy)
 
 
 def named_footage(summary: Mapping[str, Any]) -> Path | None:

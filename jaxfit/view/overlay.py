@@ -58,6 +58,11 @@ def check_belongs(
     """
     if not solution.valid.any():
         raise InputError("result", "holds no valid pose, so there is nothing to draw", "see the status of each track")
+    sizes = np.unique(solution.crops.image_size_px[solution.valid], axis=0).tolist()
+    if len(sizes) > 1:
+        shown = " and ".join(f"{width}×{height}" for width, height in sizes[:2])
+        remedy = "`jaxfit report` without a video shows its birds; jaxfit.contact_sheet draws each in its image"
+        raise InputError("result", f"holds images of several sizes ({shown}), which no video has", remedy)
     differences = [] if force else _differences(solution, video, info)
     if differences:
         raise InputError(video, f"is not the video of the result: it has {', '.join(differences)}", _REMEDY)
@@ -192,9 +197,9 @@ def overlay(
         ValueError: `max_width` below 16.
         InputError: the video does not exist; without `force`, the video has another image size, number of frames or
             first frame than the video of the result, or the observations have another image size; the video has no
-            frame of the result; the observations share no bird with the result; the result has no valid pose; an output
-            file exists without `overwrite`, or is the footage; `out` cannot hold the codec; or the system rejects the
-            write. Nothing is written then.
+            frame of the result; the observations share no bird with the result; the result has no valid pose, or images
+            of several sizes; an output file exists without `overwrite`, or is the footage; `out` cannot hold the codec;
+            or the system rejects the write. Nothing is written then.
     """
     video, out = Path(video), Path(out)
     if max_width is not None and max_width < 16:

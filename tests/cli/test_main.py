@@ -72,7 +72,12 @@ def test_photographs_are_no_video(inputs, tmp_path, capsys):
         "--video",
     ):
         assert absent not in page
-    rejected(capsys, ["report", str(out), "--video", str(given)], "holds photographs", "remove --video")
+    video = ["--video", str(inputs)]
+    rejected(capsys, ["report", str(out), *video], "holds photographs", "remove --video")
+    overlay = ["overlay", str(out), *video, "--out", str(tmp_path / "overlay.mp4")]
+    rejected(capsys, overlay, "holds photographs, which are not the frames of one video", "`jaxfit report` says how")
+    rejected(capsys, ["view", str(out), *video, "--save", str(tmp_path / "page")], "holds photographs", "leave out")
+    assert main(["view", str(out), "--save", str(tmp_path / "page")]) == 0
 
 
 def test_the_stored_config_reproduces_the_result(fitted, inputs, tmp_path, capsys):

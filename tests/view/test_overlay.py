@@ -346,6 +346,11 @@ def test_a_video_that_is_not_the_results(tmp_path):
     refused("text.mp4", "not a readable video", video=tmp_path / "text.mp4")
     empty = dataclasses.replace(solution(), valid=np.zeros((N, T), bool))
     refused("no valid pose", result=empty)
+    sizes = solution().crops.image_size_px.copy()
+    sizes[0, 1] = 100, 60
+    several = solution().with_arrays(image_size_px=sizes)
+    refused("holds images of several sizes (100×60 and 320×200), which no video has", result=several)
+    refused("holds images of several sizes", result=several, force=True)
     other = dataclasses.replace(detections(), keypoint_names=("horn", *BIRD.keypoint_names[1:]))
     refused("horn", observations=other)
     with pytest.raises(ValueError, match="max_width"):

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.observations import Observations, check_keypoints
-from jaxfit.data.result_folder import CONFIG, OBSERVATIONS, named_footage, read_summary
+from jaxfit.data.result_folder import CONFIG, OBSERVATIONS, check_is_of_video, named_footage, read_summary
 from jaxfit.data.solution import Solution, load_solution
 from jaxfit.data.world import as_filmed
 from jaxfit.foundation.errors import InputError
@@ -125,8 +125,8 @@ def report_of_result(
         if not np.array_equal(observations.frame_index, solution.frame_index):
             problem = "has other frames than poses.npz, so it belongs to another result"
             raise InputError(folder / OBSERVATIONS, problem, "remove it, or run the reconstruction again")
-    if video is not None and content.get("photographs"):
-        raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
+    if video is not None:
+        check_is_of_video(folder, content, "remove --video")
     footage = _footage(content, video)
     of_folder = partial(describe, folder)
     write_report(path, solution, bird, observations, content, config, folder, footage, force, measured, of_folder)
