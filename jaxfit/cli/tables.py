@@ -116,6 +116,9 @@ def evaluation_tables(result: Evaluation, follows: Mapping[int, int] | None = No
             "to the root and after scaling each track by one factor; PA: after alignment of every frame; orientation "
             "error in degrees; acceleration error in units per frame²; size: error of the apparent size"
         )
+        bones, mean_bird = (100 * result.overall[name] for name in ("bone_error", "bone_error_mean_bird"))
+        if not math.isnan(bones):
+            table_3d.caption += f"; error of the bone lengths {bones:.1f} % ({mean_bird:.1f} % for the mean bird)"
         tables.append(table_3d)
     return tables
 

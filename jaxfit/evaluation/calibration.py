@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -108,18 +108,37 @@ def calibration(solution: Solution, truth: Truth) -> Calibration:
     covariance = solution.cells()["keypoints_px_cov"][counted]
     groups = {"keypoints, image": _group(error_px[counted], covariance, labels[counted], names, "px")}
     if truth.solution is not None:
-        groups |= _spatial_groups(solution, truth.solution, has_bars, truth.source)
+        groups |= _spatial_groups(solution, truth.solution, truth.source)
     groups = {name: group for name, group in groups.items() if group.overall.count}
     if not groups:
         raise InputError(truth.source, "shares no bird with error bars with the result", "give the truth of the video")
     return Calibration(groups, int((both & has_bars).sum()), int((both & ~has_bars).sum()))
 
 
-def _spatial_groups(solution: Solution, truth: Solution, has_bars: np.ndarray, source: object) -> dict[str, Any]:
+class KeypointErrors(NamedTuple):
+    """Errors of the keypoints in space of M poses, and their covariances; real camera's frame, model units."""
+
+    counted: Bool[np.ndarray, "N T"]
+    """The M poses: the result and the truth have a pose, and the result has error bars."""
+    error: Float[np.ndarray, "M K 3"]
+    covariance: Float[np.ndarray, "M K 3 3"]
+
+    def squared(self) -> Float[np.ndarray, "M K"]:
+        """Return z² of every keypoint."""
+        return _squared(self.error, _regular(self.covariance))
+
+
+def keypoint_errors(solution: Solution, truth: Solution, source: object = "truth") -> KeypointErrors:
+    """Return the errors of *keypoints, 3D*.
+
+    Args:
+        solution: a result with error bars, whose tracks are matched with the truth by id.
+        truth: the exact poses.
+        source: the file or folder of the truth, for error messages.
+    """
     n, t, shared = match(solution, truth.track_id, truth.frame_index)
-    counted = shared & solution.valid & has_bars & truth.valid[n, t]
-    principal, focal = real_camera(truth, source)
-    R = crop_rotation(solution.crops.square_px[..., :2] + solution.crops.square_px[..., 2:] / 2, principal, focal)
+    counted = shared & solution.valid & np.isfinite(solution.cells()["misfit"]) & truth.valid[n, t]
+    R = _rotations(solution, truth, source)
     order = [truth.keypoint_names.index(name) for name in solution.keypoint_names]
     p, q = solution.keypoints.cam.astype(np.float64), truth.keypoints.cam[n, t][:, :, order].astype(np.float64)
     p = (p - p.mean(2, keepdims=True)) @ np.swapaxes(R, -1, -2)
@@ -127,8 +146,21 @@ def _spatial_groups(solution: Solution, truth: Solution, has_bars: np.ndarray, s
     size = best_scale(p, q, counted)[:, None, None, None]
     turn = (size[..., None] * R[:, :, None])[counted]
     covariance = turn @ solution.cells()["keypoints_centred_cov"][counted].astype(np.float64) @ turn.swapaxes(-1, -2)
-    error, label = (size * p - q)[counted].reshape(-1, 3), np.tile(np.arange(len(order)), len(covariance))
-    covariance = covariance.reshape(-1, 3, 3)
+    return KeypointErrors(counted, (size * p - q)[counted], covariance)
+
+
+def _rotations(solution: Solution, truth: Solution, source: object) -> Float[np.ndarray, "N T 3 3"]:
+    """Return the rotations from the crops' cameras to the real camera."""
+    principal, focal = real_camera(truth, source)
+    square_px = solution.crops.square_px
+    return crop_rotation(square_px[..., :2] + square_px[..., 2:] / 2, principal, focal)
+
+
+def _spatial_groups(solution: Solution, truth: Solution, source: object) -> dict[str, Any]:
+    n, t, _ = match(solution, truth.track_id, truth.frame_index)
+    counted, error, covariance = keypoint_errors(solution, truth, source)
+    label = np.tile(np.arange(error.shape[1]), len(error))
+    error, covariance = error.reshape(-1, 3), covariance.reshape(-1, 3, 3)
     groups = {"keypoints, 3D": _group(error, covariance, label, solution.keypoint_names, "model units")}
     if sorted(solution.joint_names) == sorted(truth.joint_names):
         order = [truth.joint_names.index(name) - 1 for name in solution.joint_names[1:]]
@@ -139,7 +171,7 @@ def _spatial_groups(solution: Solution, truth: Solution, has_bars: np.ndarray, s
         )
         root = np.arange(len(R_own)) % own.shape[1] == 0
         R_crop = np.broadcast_to(np.eye(3), (len(R_own), 3, 3)).copy()
-        R_crop[root] = R[counted]
+        R_crop[root] = _rotations(solution, truth, source)[counted]
         delta = ((Rotation.from_matrix(R_crop) * R_own).inv() * R_true).as_rotvec()
         cells = solution.cells()
         sd = np.concatenate([cells["global_orient_sd"][:, :, None], cells["body_pose_sd"]], axis=2)[counted]
@@ -165,10 +197,9 @@ def _group(
     finite = np.isfinite(covariance).all((1, 2)) & np.isfinite(error).all(1)
     error, covariance = error[finite].astype(np.float64), covariance[finite].astype(np.float64)
     label, d = label[finite], error.shape[1]
-    # rounding of float32 may make a tiny eigenvalue negative
+    covariance = _regular(covariance)
     trace = np.trace(covariance, axis1=1, axis2=2)
-    covariance = covariance + (1e-6 * trace / d + 1e-12)[:, None, None] * np.eye(d)
-    squared = np.einsum("mi,mi->m", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+    squared = _squared(error, covariance)
     nll = 0.5 * (squared + np.linalg.slogdet(covariance)[1] + d * np.log(2 * np.pi))
     error2, sd = (error**2).sum(1), np.sqrt(trace / d)
 
@@ -189,6 +220,17 @@ def _group(
     constant = sum(part.count * part.nll_constant for part in parts.values()) / max(len(label), 1)
     overall = replace(row(np.ones(len(label), bool)), nll_constant=constant)
     return CalibrationGroup(unit, overall, parts, _coverage(squared, d, PLOTTED))
+
+
+def _regular(covariance: Float[np.ndarray, "*M d d"]) -> Float[np.ndarray, "*M d d"]:
+    """Return the covariances with slightly larger eigenvalues: rounding of float32 may make a tiny one negative."""
+    d = covariance.shape[-1]
+    trace = np.trace(covariance, axis1=-2, axis2=-1)
+    return covariance + (1e-6 * trace / d + 1e-12)[..., None, None] * np.eye(d)
+
+
+def _squared(error: Float[np.ndarray, "*M d"], covariance: Float[np.ndarray, "*M d d"]) -> Float[np.ndarray, "*M"]:
+    return (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1)
 
 
 def _coverage(squared: np.ndarray, d: int, levels: Sequence[float]) -> dict[str, float]:

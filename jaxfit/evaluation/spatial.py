@@ -114,6 +114,8 @@ COLUMNS_3D = (
     "acceleration",
     "size_error",
     "size_bias",
+    "bone_error",
+    "bone_error_mean_bird",
 )
 _REMEDY = "give the truth that the simulation wrote with the scene"
 
@@ -140,7 +142,11 @@ class SpatialErrors:
       frame of the file (``acceleration_errors``);
     - ``size_error``, ``size_bias``: mean over frames of |r − 1| and of r − 1. r is the ratio of the predicted to the
       true apparent size: rest body length · scale · focal (image pixels) / depth of the root. The rest lengths cancel
-      if both models are the same; they are 1 where a model lacks the keypoints.
+      if both models are the same; they are 1 where a model lacks the keypoints;
+    - ``bone_error``: mean over bones and frames of |a·b − l| / l. b and l are the lengths of a bone in the result and
+      in the truth, and the factor a = Σ b·l / Σ b² removes the size; NaN where the models have different joints;
+    - ``bone_error_mean_bird``: the same with the mean bone lengths of the model in place of b: the error of a result
+      that knows only the mean bird.
 
     The points are the joints, matched by name, where both models have the same joints, and joint 0 is the root.
     Otherwise the points are the keypoints, and their mean is the root.
@@ -193,6 +199,14 @@ class SpatialErrors:
         orient_q = axis_angle_to_matrix(jnp.asarray(truth.poses.global_orient[n, t]))
         angle = np.rad2deg(np.asarray(geodesic_distance(orient_p, orient_q), np.float64))
         self.angle_deg = angle if same else np.full(angle.shape, np.nan)
+        self.bones = self.mean_bones = np.full((*self.measured.shape, 1), np.nan)
+        if same:
+            joints = [solution.joint_names.index(name) - 1 for name in truth.joint_names[1:]]
+            true_length = _rest_bones(truth_bird) * truth.poses.bone_length[n, t].astype(np.float64)
+            self.bones, self.mean_bones = (
+                _bone_errors((_rest_bones(bird) * length)[..., joints], true_length)
+                for length in (solution.poses.bone_length, np.asarray(bird.bone_mean))
+            )
         with np.errstate(divide="ignore", invalid="ignore"):
             rest = rest_length(bird) / rest_length(truth_bird)
             ratio = _apparent_size(solution, bird) / _apparent_size(truth, truth_bird)[n, t]
@@ -205,7 +219,10 @@ class SpatialErrors:
         direct, aligned = distances(p, q, counted), distances(metrics.procrustes_align(p, q, counted), q, counted)
 
         def of_frames(values: Float[np.ndarray, "N T"]) -> Float[np.ndarray, "N T 1"]:
-            return np.where(self.measured, values, np.nan)[..., None]
+            return of_bones(values[..., None])
+
+        def of_bones(values: Float[np.ndarray, "N T B"]) -> Float[np.ndarray, "N T B"]:
+            return np.where(self.measured[..., None], values, np.nan)
 
         return {
             "mpjpe": direct,
@@ -216,7 +233,23 @@ class SpatialErrors:
             "acceleration": acceleration_errors(p, q, self.measured, self.frame_index),
             "size_error": of_frames(np.abs(self.size_ratio - 1)),
             "size_bias": of_frames(self.size_ratio - 1),
+            "bone_error": of_bones(self.bones),
+            "bone_error_mean_bird": of_bones(self.mean_bones),
         }
+
+
+def _rest_bones(bird: Bird) -> Float[np.ndarray, "B"]:
+    """Return the lengths of the bones of the rest skeleton, model units."""
+    joints = np.asarray(bird.joints, np.float64)
+    return np.linalg.norm(joints[1:] - joints[np.asarray(bird.parents[1:])], axis=1)
+
+
+def _bone_errors(own: Float[np.ndarray, "*#N B"], true: Float[np.ndarray, "*N B"]) -> Float[np.ndarray, "*N B"]:
+    """Return the error of each length as a share of the true length, after one factor for all bones; NaN for a bone
+    without length."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = (own * true).sum(-1, keepdims=True) / (own**2).sum(-1, keepdims=True)
+        return np.where(true > 0, np.abs(factor * own / true - 1), np.nan)
 
 
 def real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:

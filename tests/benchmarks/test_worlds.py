@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.birds import toy_bird
+from support.birds import error_bars, toy_bird
 
 from jaxfit.data.observations import Observations
 from jaxfit.evaluation.bootstrap import BirdSums
@@ -57,7 +57,7 @@ def test_true_poses_have_no_error(name, worlds, request):
     values = sums.values()
     assert missing == 0
     assert values["iou"] == pytest.approx(1, abs=1e-3)
-    for metric in ("me_p", "aligned", "mpjpe/length", "size_error"):
+    for metric in ("me_p", "aligned", "mpjpe/length", "size_error", "bone_error"):
         assert values[metric] == pytest.approx(0, abs=1e-4), metric
 
 
@@ -76,6 +76,29 @@ def test_known_errors_are_measured(window, worlds):
     assert values["size_bias"] == pytest.approx(0.1, abs=0.01)
     length = np.linalg.norm(np.subtract((0, 9, 2.8), (0, -7.9, 0))) * poses.poses.scale.mean()
     assert values["aligned"] / values["aligned/length"] == pytest.approx(length, rel=0.03)
+
+
+def test_bones_and_coverage_are_measured(individuals, worlds):
+    poses, rng = individuals.poses, np.random.default_rng(0)
+    assert np.isnan(worlds.measure(poses, individuals, False)[0].values()["in_0.68"])
+    mean = poses.with_arrays(bone_length=np.ones_like(poses.poses.bone_length))
+    values = worlds.measure(mean, individuals, False)[0].values()
+    assert 0.02 < values["bone_error"] < 0.07
+    assert values["bone_error"] == pytest.approx(values["bone_error_mean_bird"])
+    error = 0.1 * rng.standard_normal(poses.keypoints.cam.shape)
+    error -= error.mean(2, keepdims=True)
+    K = error.shape[2]
+    covariance = 0.1**2 * (1 - 1 / K) * np.eye(3)
+    moved = poses.keypoints.cam + error
+    bars = error_bars(poses, keypoints_centred_cov=covariance, misfit=1.0)
+    sums = worlds.measure(poses.with_arrays(keypoints_cam=moved, **bars), individuals, False)[0]
+    spread = 3 * np.sqrt(0.68 * 0.32 / error[..., 0].size)
+    assert sums.value("in_0.68") == pytest.approx(0.68, abs=spread)
+    assert sums.value("in_0.95") == pytest.approx(0.95, abs=spread)
+    wider = error_bars(poses, keypoints_centred_cov=9 * covariance, misfit=1.0)
+    assert (
+        worlds.measure(poses.with_arrays(keypoints_cam=moved, **wider), individuals, False)[0].value("in_0.68") > 0.97
+    )
 
 
 def test_rotation_and_size_are_no_aligned_error(window, worlds):

@@ -32,6 +32,7 @@ import yaml
 from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import chi2
 from world_scenes import WORLDS, Scene, keypoints_of
 
 import jaxfit
@@ -42,10 +43,11 @@ from jaxfit.config.fit import FitConfig, load_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation.bootstrap import BirdSums, paired_ratio
+from jaxfit.evaluation.calibration import keypoint_errors
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.metrics import distances, procrustes_align
 from jaxfit.evaluation.spatial import best_scale, crop_rotation
-from jaxfit.evaluation.truth import match, match_tracks
+from jaxfit.evaluation.truth import Truth, match, match_tracks
 from jaxfit.fitting.fit import fit
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
@@ -65,9 +67,14 @@ METRICS = {
     "pck@0.05": ("PCK@0.05", 1, 4),
     "size_error": ("size error %", 100, 2),
     "size_bias": ("size bias %", 100, 2),
+    "bone_error": ("bones %", 100, 2),
+    "bone_error_mean_bird": ("mean bird %", 100, 2),
+    "in_0.68": ("in 68 %", 100, 1),
+    "in_0.95": ("in 95 %", 100, 1),
 }
 """Metric → heading, factor, decimals. `aligned` is the PA-MPJPE of the keypoints in model units; `…/length` is a share
-of the rest distance from bill tip to tail tip."""
+of the rest distance from bill tip to tail tip. `bones %` is the error of the bone lengths, beside that of the mean bird
+of the model; `in 68 %` is the percentage of keypoints in space inside the 68 % region of the error bars."""
 GATED = ("me_p", "aligned", "iou")
 """Metrics in which a shipped config may not be significantly worse than the reference."""
 MEASURED_PACKAGES = (
@@ -168,13 +175,26 @@ def errors_3d(solution: Solution, scene: Scene, pictures: bool) -> dict[str, Flo
         "aligned/length": aligned / length[..., None],
         "size_error": np.abs(ratio - 1),
         "size_bias": ratio - 1,
+        **coverage(solution, truth),
     }
+
+
+def coverage(solution: Solution, truth: Solution) -> dict[str, Float[np.ndarray, "N T K"]]:
+    """Return whether each keypoint in space lies inside the regions of 68 and 95 % (1 or 0); NaN without error bars."""
+    inside = {f"in_{level}": np.full(solution.keypoints.cam.shape[:-1], np.nan) for level in (0.68, 0.95)}
+    if solution.error_bars is not None:
+        errors = keypoint_errors(solution, truth)
+        squared = errors.squared()
+        for level in (0.68, 0.95):
+            within = np.where(np.isfinite(squared), squared <= chi2.ppf(level, 3), np.nan)
+            inside[f"in_{level}"][errors.counted] = within
+    return inside
 
 
 def measure(solution: Solution, scene: Scene, pictures: bool) -> tuple[BirdSums, int]:
     """Return the errors of a result per bird, and the number of true birds and frames without a pose."""
     solution, _ = match_tracks(solution, scene.exact)
-    evaluation = evaluate(solution, scene.bird, scene.exact)
+    evaluation = evaluate(solution, scene.bird, Truth(scene.exact, scene.poses))
     sums = evaluation.sums
     if scene.poses is not None:
         tracks = solution.track_id.tolist()
@@ -304,7 +324,7 @@ def report(number: int, configs: Mapping[str, Mapping[str, Sequence[Mapping[str,
         number: of the world.
         configs: name of a config → seed → results of `run`.
     """
-    world, console = WORLDS[number], Console(width=200)
+    world, console = WORLDS[number], Console(width=250)
     first = next(iter(configs.values()))
     parts = sorted({result["part"] for results in first.values() for result in results})
     for part in [None, *(parts if len(parts) > 1 else [])]:

@@ -103,8 +103,9 @@ def test_a_crop_camera_is_undone(factor):
     assert found.points == "joints"
     row = row_of(found)
     assert tuple(row) == COLUMNS_3D
-    for name, bound in zip(COLUMNS_3D, (1e-3, 1e-4, 1e-3, 1e-4, 0.01, 0.01, 2e-3, 1e-4, 1e-4), strict=True):
+    for name, bound in zip(COLUMNS_3D, (1e-3, 1e-4, 1e-3, 1e-4, 0.01, 0.01, 2e-3, 1e-4, 1e-4, 1e-6), strict=False):
         assert abs(row[name]) < bound, name
+    assert 0.05 < row["bone_error_mean_bird"] < 0.15  # 10 % of each length
 
 
 def joints_by_hand(pose):
@@ -143,6 +144,12 @@ def oracle(predicted, truth, valid):
             ratio = float(a.scale[t]) / p[t, 0, 2] / (float(b.scale[t]) / q[t, 0, 2])
             figures["size_error"].append(abs(ratio - 1))
             figures["size_bias"].append(ratio - 1)
+            rest_bones = [math.dist(BIRD.joints[j], BIRD.joints[BIRD.parents[j]]) for j in range(1, J)]
+            true = np.multiply(rest_bones, b.bone_length)
+            for name, length in (("bone_error", a.bone_length), ("bone_error_mean_bird", BIRD.bone_mean)):
+                own = np.multiply(rest_bones, length)
+                factor = np.linalg.lstsq(own[:, None], true, rcond=None)[0]
+                figures[name] += list(np.abs(factor * own - true) / true)
             if ok[t - 1 : t + 2].sum() == 3 and t and FRAMES[t - 1 : t + 2] == [FRAMES[t] + i for i in (-1, 0, 1)]:
                 twice = [x[t - 1] - 2 * x[t] + x[t + 1] for x in (p_root, q_root)]
                 figures["acceleration"] += list(np.linalg.norm(twice[0] - twice[1], axis=1))
@@ -210,6 +217,7 @@ def test_another_model_is_compared_by_keypoints():
     assert found.points == "keypoints"
     row = row_of(found)
     assert math.isnan(row["orientation_deg"])
+    assert math.isnan(row["bone_error"])
     p, q = (np.asarray(s.keypoints.cam, float) for s in (solution, build(true_poses())))
     p, q = p - p.mean(2, keepdims=True), q - q.mean(2, keepdims=True)
     scale = (p * q).sum((1, 2, 3)) / (p * p).sum((1, 2, 3))
@@ -232,6 +240,7 @@ def test_joints_are_compared_by_name():
     found = errors(solution.with_arrays(joint_names=names, **moved), bird=bird)
     assert found.points == "joints"
     assert row_of(found)["mpjpe"] < 1e-3
+    assert row_of(found)["bone_error"] < 1e-6
 
 
 @pytest.mark.parametrize(
