@@ -177,9 +177,10 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     if options.ledge == WORLD:
         plane_of(read.views.lenses[0], options.cameras)  # before the long work
     source = ", ".join(map(str, options.observations))
-    measured = with_unit(read.views, bird, source)
+    measured, facts = with_unit(read.views, bird, source), {}
     if bird.metres_per_unit is None:
         length_cm = 100 * rest_length(measured) * (measured.metres_per_unit or 1.0)
+        facts["measured_length_cm"] = round(length_cm, 2)
         show(f"model {bird.name} has no unit of length: measured by the cameras, bill to tail {length_cm:.1f} cm")
     bird = measured
     read_s = time.perf_counter() - start
@@ -194,7 +195,7 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
         }
         for b in range(matches.birds)
     }
-    facts = {"cameras": [camera.name for camera in lenses], "matches": matched}
+    facts |= {"cameras": [camera.name for camera in lenses], "matches": matched}
     subject = f"{counted(len(solution.track_id), 'bird')} in {counted(len(read.tracks), 'view')}"
     _write_fit(options, config, bird, solution, read.views, seconds, facts, subject)
 

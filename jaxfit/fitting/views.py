@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -162,9 +162,26 @@ def fit_views(
     fitted = [results[problem] for problem in task.problems]
     if config.overlap_frames:
         fitted = blend_seams(windows, fitted, model)
-    solution = _solution(views, prepared[0], windows, fitted, bird, origin_m, unit_m)
+    skipped = without_orientation(prepared[0], points, has_pose)
+    solution = _solution(views, prepared[0], windows, fitted, bird, origin_m, unit_m, skipped)
     seen = ((in_camera(solution, bird, camera), own) for camera, own in zip(views.cameras, checked, strict=True))
     return with_doubts_of_views(solution, seen, bird, progress)
+
+
+def without_orientation(
+    observations: Observations, points: Float[np.ndarray, "N T K 3"], has_pose: Bool[np.ndarray, "N T"]
+) -> dict[int, tuple[str, ...]]:
+    """Return track → text about a bird without any initial pose, as `Solution.failures`, and log a warning for each."""
+    enough = (np.isfinite(points).all(-1).sum(-1) >= MIN_POINTS).sum(-1)
+    texts = {}
+    for n in np.flatnonzero(~has_pose.any(-1)).tolist():
+        text = f"no frame has {MIN_POINTS} keypoints that two cameras agree on"
+        if enough[n]:
+            text = f"in {enough[n]} frames, the keypoints are too close to a line, so its orientation is unknown"
+        track = int(observations.track_id[n])
+        _logger.warning("bird %d is not fitted: %s", track, text)
+        texts[track] = (f"not fitted: {text}",)
+    return texts
 
 
 def _weights(keypoints: ViewKeypoints, found: Triangulated) -> Float[np.ndarray, "N T K"]:
@@ -374,6 +391,7 @@ def _solution(
     bird: Bird,
     origin_m: np.ndarray,
     unit_m: float,
+    skipped: Mapping[int, tuple[str, ...]],
 ) -> Solution:
     """Return the poses of all windows, in the frame of the first camera and in the world."""
     camera, cells = views.lenses[0], (first.num_tracks, first.num_frames)
@@ -390,7 +408,7 @@ def _solution(
         values = _frame_values(result, windows.present[w], bird, camera, origin_m, unit_m)
         return values | _frame_error_bars(result, windows.present[w], crop, bird, camera)
 
-    gathered = gather_windows(first, windows, results, arrays, values_of, {})
+    gathered = gather_windows(first, windows, results, arrays, values_of, skipped)
     width, height = first.image_size_px[0].tolist()
     crops = whole_picture(camera, gathered["valid"], (width, height))
     return Solution.from_arrays(

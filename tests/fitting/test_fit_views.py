@@ -19,9 +19,10 @@ from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.data.views import Views, birds_in_rows, stacked_keypoints, straightened
 from jaxfit.export.export import export_result
 from jaxfit.export.result import open_result
-from jaxfit.fitting.views import fit_views, initial_poses, views_config, with_unit
+from jaxfit.fitting.views import fit_views, initial_poses, views_config, with_unit, without_orientation
 from jaxfit.foundation.errors import InputError
-from jaxfit.model.files import load_murre
+from jaxfit.model.bird import rest_length
+from jaxfit.model.files import load_murre, save_bird
 from jaxfit.review.correct import read_tracks
 from jaxfit.simulation.rig import stage_rig
 
@@ -128,8 +129,20 @@ def test_a_bird_that_one_camera_sees_has_no_pose(rig):
     assert found.valid[0].all()
     assert not found.valid[1].any()
     assert found.status.tolist() == ["ok", "no usable frame"]
+    assert found.failures == {2: ("not fitted: no frame has 4 keypoints that two cameras agree on",)}
     with pytest.raises(InputError, match="have no bird with 21 keypoints in two cameras"):
         fit_views(views, BIRD, replace(quick, min_keypoints=21))
+
+
+def test_a_bird_whose_keypoints_lie_on_a_line_is_named(rig, views, truth_m, caplog):
+    points = truth_m / UNIT
+    points[1] = np.linspace(0, 9, points.shape[2])[:, None]
+    initial = initial_poses(BIRD, points, np.ones(points.shape[:3]), "truth")
+    has_pose = np.isfinite(initial.global_orient).all(-1)
+    texts = without_orientation(views.observations[0], points, has_pose)
+    reason = f"in {FRAMES} frames, the keypoints are too close to a line, so its orientation is unknown"
+    assert texts == {2: (f"not fitted: {reason}",)}
+    assert caplog.messages == [f"bird 2 is not fitted: {reason}"]
 
 
 def test_one_view_is_the_fit_of_one_camera(rig, truth_m, monkeypatch):
@@ -223,7 +236,8 @@ def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
     config = tmp_path / "quick.yaml"
     config.write_text("base: fast\nwindow: 6\noverlap: 4\nfilter_window: 1\ncrop: {size_px: 64}\n")
     out = tmp_path / "result"
-    command = ["fit", *files, "--config", str(config), "--out", str(out)]
+    save_bird(replace(BIRD, metres_per_unit=None), tmp_path / "model.npz")
+    command = ["fit", *files, "--config", str(config), "--model", str(tmp_path / "model.npz"), "--out", str(out)]
     assert main([*command, "--cameras", str(tmp_path / "rig.toml")]) == 0
     printed = capsys.readouterr().out
     assert "16 poses of 2 birds in 3 views" in printed
@@ -231,6 +245,12 @@ def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
     solution, summary = load_solution(out)[0], json.loads((out / "summary.json").read_text())
     assert summary["flags"] == flag_counts(solution.flags.doubts)
     assert sum(summary["flags"].values()) == 16
+    true_cm = 100 * UNIT * rest_length(BIRD)
+    assert summary["measured_length_cm"] == pytest.approx(true_cm, rel=0.05)
+    assert main(["report", str(out)]) == 0
+    length = f"{summary['measured_length_cm']:.1f} cm from bill to tail, measured by the cameras"
+    assert length in (out / "report.html").read_text()
+    assert f"bill to tail {summary['measured_length_cm']:.1f} cm" in printed
     assert solution.world is not None
     order = np.linalg.norm(solution.world.transl_world_m[:, None, 0] - truth_m[None, :, 0].mean(-2), axis=-1).argmin(1)
     assert error_mm(solution, truth_m[order]) < 15

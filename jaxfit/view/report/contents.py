@@ -191,6 +191,9 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
     facts, video = {}, summary.get("video") or {}
     if summary.get("model"):
         facts["model"] = f"{summary['model']['name']} ({summary['model']['hash'][:12]})"
+    if summary.get("measured_length_cm"):
+        length_cm = float(summary["measured_length_cm"])
+        facts["length of the model"] = f"{length_cm:.1f} cm from bill to tail, measured by the cameras"
     for kind, files in entries("networks"):
         facts[f"network: {kind}"] = ", ".join(f"{name} ({digest[:12]})" for name, digest in files.items())
     facts |= {name: str(version) for name, version in entries("versions")}
