@@ -78,6 +78,26 @@ def test_known_errors_are_measured(window, worlds):
     assert values["aligned"] / values["aligned/length"] == pytest.approx(length, rel=0.03)
 
 
+def test_a_fit_with_another_model(scenes, worlds):
+    """A model of other proportions, but the same pose, has errors; the true model has none."""
+    names = ("bill_tip", "left_wingtip", "right_wingtip", "tail_tip", "nape")
+    true = scenes.with_keypoints(toy_bird(), names)
+    assert true.keypoint_pairs == ((1, 2),)
+    np.testing.assert_allclose(true.keypoints[0], toy_bird().keypoints[toy_bird().keypoint_names.index("bill_tip")])
+    scene = scenes.windows_of(true, (8, 1), 2, 4, scenes._gaussian_errors)
+    stretched = replace(
+        true, joints=true.joints * np.float32([1, 1.3, 1]), vertices=true.vertices * np.float32([1, 1.3, 1])
+    )
+    other = replace(scene, bird=stretched, true_bird=true)
+    values = worlds.measure(scene.poses, replace(scene, true_bird=true), False)[0].values()
+    assert values["bone_error"] == pytest.approx(0, abs=1e-6)
+    assert values["size_error"] == pytest.approx(0, abs=1e-6)
+    values = worlds.measure(scene.poses, other, False)[0].values()
+    assert values["aligned"] == pytest.approx(0, abs=1e-4)  # the keypoints of the result are the true ones
+    assert 0.02 < values["bone_error"] < 0.3
+    assert 0.2 < values["size_bias"] < 0.3  # the rest length is mainly along the body
+
+
 def test_bones_and_coverage_are_measured(individuals, worlds):
     poses, rng = individuals.poses, np.random.default_rng(0)
     assert np.isnan(worlds.measure(poses, individuals, False)[0].values()["in_0.68"])

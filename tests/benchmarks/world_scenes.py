@@ -13,12 +13,17 @@
    the keypoints are correlated in time and larger in fast motion, 5 % are outliers of 30 px, and masks are 0.44 px too
    large.
 
+8. `other_models`: windows as in world 7 whose birds have another model than the fit. The part names the true model and
+   the model of the fit: AVES and avian-mesh, avian-mesh and AVES, and a random species (from the shape space of AVES)
+   and the murre. Both models have only their common keypoints: nine (bill tip, eyes, nape, wingtips, feet, tail tip),
+   and for the murre the 18 of AVES. Even where they share a name, the keypoints lie at different places of the bodies.
+
 Birds are individuals: in worlds 1, 2, 3 and 6 their bones differ by 5 % from those of the model, in world 3 also their
 shapes, and in world 1 the keypoints of the detector lie beside those of the model. With `equal`, all birds of these
-worlds have the body of the model, in the same motion. World 4 draws species, world 5 is real, and world 7 is without
-this choice.
+worlds have the body of the model, in the same motion. World 4 draws species, world 5 is real, and worlds 7 and 8 are
+without this choice.
 
-In worlds 3, 4, 6 and 7, every bird has an image of its own, so that no bird hides another bird.
+In worlds 3, 4, 6, 7 and 8, every bird has an image of its own, so that no bird hides another bird.
 """
 
 from __future__ import annotations
@@ -78,7 +83,7 @@ class Scene:
     """Observations of some birds, and the truth about these birds."""
 
     bird: Bird
-    """The model of the fit; the true poses have the same model, with other shapes and bone lengths in world 4."""
+    """The model of the fit."""
     observations: Observations
     """The input of the fit."""
     exact: Observations
@@ -89,6 +94,8 @@ class Scene:
     """Part of the world that is also reported alone."""
     initial_poses: InitialPoses | None = None
     """Initial poses for the config `aves`."""
+    true_bird: Bird | None = None
+    """The model of the true poses, with the same keypoints; None for the model of the fit."""
 
 
 class World(NamedTuple):
@@ -160,6 +167,36 @@ def aves_individuals(seed: int, quick: bool, _equal: bool) -> list[Scene]:
     return [windows_of(bird, (7, seed), *_window_size(quick), _correlated_errors, _of_prior, GROWN_PX)]
 
 
+def other_models(seed: int, quick: bool, _equal: bool) -> list[Scene]:
+    """Draw windows of individuals for fits with another model than the true one."""
+    aves, avian = published("aves", "aves"), published("avian-mesh", "avian_mesh")
+    pairs = {
+        "AVES, fitted by avian-mesh": (aves, avian, _of_prior),
+        "avian-mesh, fitted by AVES": (avian, aves, _of_prior),
+        "species, fitted by the murre": (random_species(aves, 1000 + seed), load_murre(), _individual),
+    }
+    scenes = []
+    for i, (part, (true, fitted, draw_body)) in enumerate(pairs.items()):
+        common = tuple(name for name in fitted.keypoint_names if name in true.keypoint_names)
+        bird = with_keypoints(true, common)
+        scene = windows_of(bird, (8, seed, i), *_window_size(quick), _correlated_errors, draw_body, GROWN_PX)
+        # birds of different parts must have different names, so that the intervals count all birds
+        ids = 10 * i + scene.exact.track_id
+        observations, exact, poses = (
+            replace(each, track_id=ids) for each in (scene.observations, scene.exact, scene.poses)
+        )
+        scenes.append(Scene(with_keypoints(fitted, common), observations, exact, poses, part, true_bird=bird))
+    return scenes
+
+
+def with_keypoints(bird: Bird, names: Sequence[str]) -> Bird:
+    """Return a model with only some of its keypoints, in the order of the names."""
+    at = [bird.keypoint_names.index(name) for name in names]
+    pairs = tuple((at.index(left), at.index(right)) for left, right in bird.keypoint_pairs if {left, right} <= set(at))
+    weights = bird.keypoint_weights[np.array(at)]
+    return replace(bird, keypoint_weights=weights, keypoint_names=tuple(names), keypoint_pairs=pairs)
+
+
 def _window_size(quick: bool) -> tuple[int, int]:
     """Return the number of birds and of frames."""
     return (2, 20) if quick else (3, 100)
@@ -185,7 +222,7 @@ def _of_prior(bird: Bird, rng: np.random.Generator) -> tuple[np.ndarray, np.ndar
 
 def windows_of(
     bird: Bird,
-    seed: tuple[int, int],
+    seed: tuple[int, ...],
     birds: int,
     frames: int,
     errors: Callable[[np.random.Generator, Observations], Observations],
@@ -467,5 +504,6 @@ WORLDS = {
     5: World("photographs of five species (CUB)", cub, "aves", pictures=True, seeds=False),
     6: World("windows of avian-mesh, 12 keypoints", avian_windows, "paper"),
     7: World("windows of AVES, individuals", aves_individuals, "paper"),
+    8: World("windows of another model than that of the fit", other_models, "paper"),
 }
 """The worlds by number."""

@@ -1,4 +1,4 @@
-"""Compare configs of the fit on seven worlds with known truth, with intervals and paired ratios over birds.
+"""Compare configs of the fit on eight worlds with known truth, with intervals and paired ratios over birds.
 
 A world is a kind of data (`world_scenes.py`). No number of a shipped config may be chosen on one world alone, and no
 shipped config may be significantly worse than `paper` (windows) or `aves` (pictures) in me_p, aligned 3D error or IoU
@@ -162,7 +162,7 @@ def errors_3d(solution: Solution, scene: Scene, pictures: bool) -> dict[str, Flo
         p = p * best_scale(p[:, :, None], q[:, :, None], measured[..., None])[..., None, None]
     else:
         p = p * best_scale(p, q, measured)[:, None, None, None]
-    length = rest_length(bird, truth.poses)[n, t]
+    length = rest_length(scene.true_bird or bird, truth.poses)[n, t]
     counted = np.broadcast_to(measured[..., None], p.shape[:-1])
     direct, aligned = distances(p, q, counted), distances(procrustes_align(p, q, counted), q, counted)
     focal_p = solution.crops.focal_px * solution.crops.square_px[..., 2] / solution.crops.crop_px
@@ -194,7 +194,7 @@ def coverage(solution: Solution, truth: Solution) -> dict[str, Float[np.ndarray,
 def measure(solution: Solution, scene: Scene, pictures: bool) -> tuple[BirdSums, int]:
     """Return the errors of a result per bird, and the number of true birds and frames without a pose."""
     solution, _ = match_tracks(solution, scene.exact)
-    evaluation = evaluate(solution, scene.bird, Truth(scene.exact, scene.poses))
+    evaluation = evaluate(solution, scene.bird, Truth(scene.exact, scene.poses, scene.true_bird))
     sums = evaluation.sums
     if scene.poses is not None:
         tracks = solution.track_id.tolist()
