@@ -16,7 +16,6 @@ from jaxfit.cli.tables import (
     FIT_COLUMNS,
     breakdown_tables,
     calibration_tables,
-    counted,
     evaluation_tables,
     fit_cells,
     flag_line,
@@ -26,7 +25,7 @@ from jaxfit.cli.tables import (
     wrong_poses_line,
 )
 from jaxfit.data.observations import MIN_KEYPOINTS
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text
 from jaxfit.model.files import find_bird

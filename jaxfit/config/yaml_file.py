@@ -20,7 +20,7 @@ from ruamel.yaml.representer import SafeRepresenter
 from jaxfit.config.build import Config, build_config, field_help, plain_config
 from jaxfit.config.checks import ConfigKeyError, join_keys, known_names, shown
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.reading import reading
+from jaxfit.foundation.reading import check_readable, read_text
 
 _TAG = "tag:yaml.org,2002:"
 _MAX_VALUES = 100_000
@@ -55,9 +55,10 @@ def read_yaml(text: str, source: object) -> YamlMapping:
         reader = _Reader(source, loader.constructor)
         return YamlMapping(reader.mapping(root, ""), reader.lines)
     except YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"line {mark.line + 1} " if mark else ""
-        raise InputError(source, f"{where}is not valid YAML: {getattr(error, 'problem', None) or error}") from None
+        mark = getattr(error, "problem_mark", None)  # a character that YAML forbids has a position instead
+        line = mark.line if mark else text.count("\n", 0, getattr(error, "position", 0))
+        problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
+        raise InputError(source, f"line {line + 1} is not valid YAML: {problem}") from None
     except RecursionError:
         raise InputError(source, "is nested too deeply", "use fewer levels") from None
 
@@ -68,9 +69,7 @@ def read_yaml_file(path: str | Path, absent: str = "check the path") -> YamlMapp
     Raises:
         InputError: the path is not a readable file, or as `read_yaml`.
     """
-    with reading(path, "a YAML file", absent=absent) as file:
-        text = file.read_text(encoding="utf-8-sig")
-    return read_yaml(text, path)
+    return read_yaml(read_text(check_readable(path, "a YAML file", absent), "a YAML file"), path)
 
 
 class _Reader:

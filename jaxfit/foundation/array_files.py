@@ -176,7 +176,9 @@ def npz_names(path: str | Path) -> set[str]:
 def _archive(path: str | Path) -> Iterator[np.lib.npyio.NpzFile]:
     """Open an ``.npz`` and convert every error of its reading in the body."""
     with reading(path, "an .npz file of plain arrays", _COPY) as path:
-        if not zipfile.is_zipfile(path):  # np.load would advise to load a pickle
+        with path.open("rb") as file:
+            is_zip = file.read(2) == b"PK" and zipfile.is_zipfile(file)
+        if not is_zip:  # np.load would advise to load a pickle
             raise InputError(path, "is not an .npz file of plain arrays", _COPY)
         with np.load(path, allow_pickle=False) as archive:
             yield archive

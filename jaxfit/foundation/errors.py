@@ -1,4 +1,4 @@
-"""The error for input that jaxfit cannot use, and messages in one line."""
+"""The error for input that jaxfit cannot use; messages in one line, and counts in them."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.reading import check_readable
 from jaxfit.video.decoding import Frame, decode, displayed_size, first_picture, frame_count, frame_rate, opened
 from jaxfit.video.pictures import image_files, page_count, read_pages, read_picture
@@ -212,7 +212,8 @@ class _End(NamedTuple):
 def warn_of_damage(path: Path, damaged: list[int], step: int) -> None:
     """Log one line with the numbers of the damaged frames of a video, if there are any."""
     if damaged:
-        _logger.warning("%s: %d damaged frames are skipped (%s)", path, len(damaged), _spans(damaged, step))
+        frames = counted(len(damaged), "damaged frame")
+        _logger.warning("%s: %s skipped (%s)", path, frames, _spans(damaged, step))
 
 
 def _spans(numbers: list[int], step: int) -> str:

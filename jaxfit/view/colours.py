@@ -62,6 +62,10 @@ OTHER_BEHAVIOUR: Colour = (155, 145, 133)
 
 FLAG_COLOURS = {"ok": "#9fb8a6", "unsure": "#f5b700", "contradicted": "#c1121f"}
 """Flag of a pose → colour in timelines of reports and of the viewer, as HTML names it."""
+CONFIDENCE_COLOURS = ("#bdd7e7", "#6baed6", "#2b7bba", "#08306b")
+"""Colours of poses in the timeline of reports, from the lowest confidence of the keypoints to the highest."""
+NO_POSE_COLOUR = "#d95f02"
+"""A detected bird without a pose in the timeline of reports."""
 
 PLUMAGE_SHARE = 0.4
 """Weight of the model's colours in the colours of a drawn bird; the rest is the colour of the track."""

@@ -257,11 +257,11 @@ def test_a_config_made_in_code_is_checked():
 
 
 def test_unreadable_files(tmp_path):
-    (tmp_path / "latin.yaml").write_bytes(b"name: \xff\xfe\x00")
+    (tmp_path / "latin.yaml").write_bytes(b"a: 3\nname: x\xff\xfe\x00")
     for source, words in [
         (tmp_path / "absent.yaml", r"absent\.yaml: does not exist.*paper"),
         (tmp_path, "is a folder, not a YAML file"),
-        (tmp_path / "latin.yaml", r"latin\.yaml: is not a YAML file that can be read"),
+        (tmp_path / "latin.yaml", r"latin\.yaml: line 2 is not UTF-8 text \(byte 12\) \(give a YAML file, saved as"),
         ("a\0b", "contains a character that no file name has"),
     ]:
         with pytest.raises(InputError, match=words):

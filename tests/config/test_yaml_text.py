@@ -67,7 +67,7 @@ def test_lines():
         ("1: 1", "line 1 holds the key '1', which is not text"),
         ("x: 1\n? [a]\n: 1", "line 2 holds the key .*, which is not text"),
         ("a: 1\nb: 2\na: 3", "line 3 holds the key `a`, which line 1 holds too"),
-        ("a: 'x\x00'", "not valid YAML"),
+        ("a: 3\nb: 'x\x00'", "line 2 is not valid YAML: unacceptable character #x0000: [a-z ]*$"),
         ("a: &a [*a]", "is nested too deeply|values of aliases"),
         ("a: *b", "line 1 is not valid YAML: found undefined alias"),
         ("a: {<<: 3}", "`<<` a value that is not a mapping"),

@@ -166,6 +166,9 @@ def test_one_line_says_what_was_read(tmp_path, caplog):
         "birds.slp: a SLEAP project of clip.mp4, 120×100: 2 birds, 4 frames (0 to 30), 3 keypoints (24 of 24 known), 0"
         in caplog.text
     )
+    with caplog.at_level("INFO"):
+        read_observations(write_csv(tmp_path / "a.csv"), size_px=(120, 100))
+    assert "120×100: 1 bird, 4 frames (0 to 3), 3 keypoints (12 of 12 known), 0 masks" in caplog.text
 
 
 def test_pictures_that_are_turned(tmp_path):

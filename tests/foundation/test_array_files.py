@@ -52,6 +52,7 @@ def test_reads_arrays(tmp_path):
         (b"", "is not an .npz file"),
         (b"not a zip at all", "of plain arrays"),
         (npz(x=np.eye(30))[:-40], "may be truncated"),
+        (npz(x=np.eye(30))[9:], r"is not an .npz file of plain arrays \("),
         (npy(np.eye(3)), "is not an .npz file"),
         (npz(x=np.random.default_rng(0).random(99)).replace(b"\0\0\0\0", b"\7\0\t\0"), "that can be read"),
         (npz(x=np.array([{}, 3], dtype=object)), "Object arrays cannot be loaded"),
@@ -62,7 +63,7 @@ def test_reads_arrays(tmp_path):
         (npz(x=np.zeros(3, complex)), "x holds complex128, expected real numbers"),
         (npz(x=np.zeros(3, "S3")), "x holds |S3"),
     ],
-    ids=range(12),
+    ids=range(13),
 )
 def test_damaged_arrays(tmp_path, content, message):
     path = tmp_path / "a.npz"

@@ -85,7 +85,7 @@ def test_images_that_cannot_be_read(tmp_path, caplog):
     assert reader.info == VideoInfo(12, 2, SIZE)
     assert [(frame.index, frame.time_s) for frame in reader] == [(i, i / 2) for i in (1, 2, 5, *range(7, 12))]
     assert reader.damaged == [0, 3, 4, 6]
-    assert caplog.messages == [f"{tmp_path}: 4 damaged frames are skipped (0, 3–4, 6)"]
+    assert caplog.messages == [f"{tmp_path}: 4 damaged frames skipped (0, 3–4, 6)"]
     cv2.imwrite(str(tmp_path / "7.png"), np.zeros((10, 20, 3), np.uint8))
     with pytest.raises(InputError, match=r"7\.png: is 20×10, but the images before are 64×48"):
         list(reader)

@@ -8,7 +8,7 @@ import pytest
 from av.stream import Disposition
 from support.films import COUNT, encode, number_in, overwrite, packets, reader_threads, write
 
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.video import decoding
 from jaxfit.video.decoding import frame_times
 from jaxfit.video.reader import VideoInfo, probe_video, read_frames
@@ -110,7 +110,7 @@ def test_a_damaged_packet(tmp_path, films, caplog, name, hit):
     assert sorted([*(frame.index for frame in late), *late.damaged]) == [45, 50, 55, 60, 65]
     assert late.damaged == [i for i in reader.damaged if i in (45, 50, 55)]
     assert any(abs(i - hit) <= 4 for i in reader.damaged)
-    assert f"{name}: {len(reader.damaged)} damaged frames are skipped (" in caplog.messages[0]
+    assert f"{name}: {counted(len(reader.damaged), 'damaged frame')} skipped (" in caplog.messages[0]
 
 
 def test_a_stream_that_begins_between_keyframes(tmp_path, films):

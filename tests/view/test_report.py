@@ -147,6 +147,8 @@ def test_the_page_stands_alone_and_shows_names_as_text(root):
     assert "<img src=x onerror=alert(1)>" in text_of(root)
     policies = [each.get("content") for each in root.iter("meta") if each.get("http-equiv")]
     assert policies == ["default-src 'none'; style-src 'unsafe-inline'; img-src data:"]
+    style = text_of(next(root.iter("style")))
+    assert set(re.findall(r"var\((--[\w-]+)\)", style)) == set(re.findall(r"(--[\w-]+):", style))
 
 
 def test_pictures_show_the_footage_with_the_birds_and_bouts_lead_to_it(drawn):

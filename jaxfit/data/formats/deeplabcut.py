@@ -28,7 +28,7 @@ import numpy as np
 
 from jaxfit.data.formats.hdf5 import hdf5_text
 from jaxfit.data.formats.keypoint_table import KeypointTable, check_table_size
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.reading import open_file
 
 COORDS = ("x", "y", "likelihood")
@@ -131,7 +131,7 @@ def read_deeplabcut_csv(path: Path) -> KeypointTable:
                     ):
                         continue  # names of the index, which some programs write
                 if len(cells) != len(header[0]):
-                    problem = f"line {lines.line_num} has {len(cells)} cells, not {len(header[0])}"
+                    problem = f"line {lines.line_num} has {counted(len(cells), 'cell')}, not {len(header[0])}"
                     raise InputError(path, problem, "the file may end midway: copy or write it again")
                 names.append("/".join(cell.strip() for cell in cells[:named] if cell.strip()))
                 rows.append(np.array([float(cells[i]) if cells[i] else np.nan for i in used]))

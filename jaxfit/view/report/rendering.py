@@ -10,7 +10,15 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from jaxfit.foundation.errors import counted, one_line
-from jaxfit.view.colours import FLAG_COLOURS, behaviour_colour, css, ink_on, track_colour
+from jaxfit.view.colours import (
+    CONFIDENCE_COLOURS,
+    FLAG_COLOURS,
+    NO_POSE_COLOUR,
+    behaviour_colour,
+    css,
+    ink_on,
+    track_colour,
+)
 from jaxfit.view.report.axis import duration
 
 
@@ -44,7 +52,9 @@ _environment.filters |= {
 }
 _environment.globals |= {
     "behaviour_colour": behaviour_colour,
+    "confidence_colours": CONFIDENCE_COLOURS,
     "flag_colours": FLAG_COLOURS,
     "ink_on": ink_on,
+    "no_pose_colour": NO_POSE_COLOUR,
     "track_colour": track_colour,
 }
