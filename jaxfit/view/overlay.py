@@ -65,7 +65,9 @@ def check_belongs(
         raise InputError("result", f"holds images of several sizes ({shown}), which no video has", remedy)
     differences = [] if force else _differences(solution, video, info)
     if differences:
-        raise InputError(video, f"is not the video of the result: it has {', '.join(differences)}", _REMEDY)
+        cameras = "give the video of the first camera, or name that of this video (--camera of overlay and view); "
+        remedy = _REMEDY if solution.world is None else cameras + "--force draws all the same"
+        raise InputError(video, f"is not the video of the result: it has {', '.join(differences)}", remedy)
     if observations is None:
         return
     remedy = "give the file that the result was fitted to"

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from jaxfit.model.bird import rest_length
 from jaxfit.model.files import load_murre, save_bird
 from jaxfit.review.correct import read_tracks
 from jaxfit.simulation.rig import stage_rig
+from jaxfit.video.reader import VideoInfo
+from jaxfit.view.overlay import check_belongs
 
 BIRD = load_murre()
 UNIT = BIRD.metres_per_unit
@@ -160,6 +163,11 @@ def test_one_view_is_the_fit_of_one_camera(rig, truth_m, monkeypatch):
     shown = rig.cameras[1].pinhole().project(found.world.keypoints_world_m)
     shift = views.cameras[0].matrix[:2, 2] - rig.cameras[1].matrix[:2, 2]
     assert np.abs(shown + shift - found.keypoints.px)[found.valid].max() < 4
+
+
+def test_the_film_of_another_camera_is_refused_with_the_option_that_helps(solution):
+    with pytest.raises(InputError, match=r"is not the video of the result: .*\(--camera of overlay and view\)"):
+        check_belongs(solution, None, Path("cam1.mp4"), VideoInfo(FRAMES, 25, (99, 60)))
 
 
 def test_exports_hold_the_world_and_the_true_size(solution, rig, tmp_path):
