@@ -428,10 +428,11 @@ def check_poses(arrays: Mapping[str, np.ndarray], fitted: np.ndarray) -> None:
             n, t = bad[0]
             raise ValueError(f"{name} {problem} for track {tracks[n]}, frame {frames[t]}")
 
-    for name, (shape, dtype) in LAYOUT.items():
-        if shape.startswith("N T") and dtype is np.float32 and name in arrays:
+    limits = {"global_orient": MAX_ANGLE_RAD, "body_pose": MAX_ANGLE_RAD, "R_world_root": 1.001}
+    for name, (shape, dtype) in (LAYOUT | WORLD).items():
+        if shape.startswith("N T") and np.dtype(dtype).kind == "f" and name in arrays:
             require(name, np.isfinite(arrays[name]), "holds NaN or infinite numbers")
-            limit = MAX_ANGLE_RAD if name in ("global_orient", "body_pose") else MAX_NUMBER
+            limit = limits.get(name, MAX_NUMBER)
             require(name, np.abs(arrays[name]) <= limit, f"holds numbers beyond {limit:g}")
     if "scale" in arrays:
         require("scale", arrays["scale"] > 0, "is not above 0")

@@ -106,3 +106,21 @@ def test_wrong_names_of_cameras(placed, folder, name, world, message):
 def test_missing_cameras(placed, tmp_path):
     with pytest.raises(InputError, match=r"cameras\.toml: does not exist"):
         as_filmed(tmp_path, placed, BIRD, "cam1")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "problem"),
+    [
+        ("R_world_root", 1e11, "numbers beyond 1.001"),
+        ("transl_world_m", np.nan, "NaN or infinite numbers"),
+        ("keypoints_world_m", 1e33, r"numbers beyond 1e\+12"),
+    ],
+)
+def test_impossible_places_in_the_world_are_refused(placed, name, value, problem):
+    values = placed.arrays()[name].copy()
+    values[0, 1] = value
+    with pytest.raises(ValueError, match=f"{name} holds {problem} for track 1, frame 1"):
+        placed.with_arrays(**{name: values})
+    valid = placed.valid.copy()
+    valid[0, 1] = False
+    placed.with_arrays(**{name: values, "valid": valid})

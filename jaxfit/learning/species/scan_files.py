@@ -181,6 +181,8 @@ def _point(name: str, value: Any, path: Path, numbered: Float[np.ndarray, "N 3"]
         point = np.zeros(0)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise InputError(path, f"{name} is not a point [x, y, z] and not a vertex number", "annotate it again")
+    if np.abs(point).max() > MAX_COORDINATE:
+        raise InputError(path, f"{name} is a point beyond {MAX_COORDINATE:g}", "annotate it again")
     return point
 
 
