@@ -49,10 +49,10 @@ class Observations:
     the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
 
     Raises:
-        ValueError: the shapes do not agree, a ``track_id`` occurs twice, ``frame_index`` does not increase, a
-            confidence or score is outside [0, 1], a confidence is above 0 where the bird is not present, a position is
-            not finite, a time stamp is infinite, ``fps`` is not positive and finite, or a mask does not have the size
-            of its image.
+        ValueError: the shapes do not agree, ``skeleton`` names an absent keypoint, a ``track_id`` occurs twice,
+            ``frame_index`` does not increase, a confidence or score is outside [0, 1], a confidence is above 0 where
+            the bird is not present, a position is not finite, a time stamp is infinite, ``fps`` is not positive and
+            finite, or a mask does not have the size of its image.
     """
 
     track_id: np.ndarray
@@ -110,6 +110,8 @@ class Observations:
                 if twice
                 else "keypoint_names must not hold an empty name"
             )
+        if any(not 0 <= k < len(names) for pair in self.skeleton for k in pair):
+            raise ValueError(f"skeleton names keypoints outside 0…{len(names) - 1}")
         if len(np.unique(arrays["track_id"])) < len(arrays["track_id"]):
             raise ValueError(f"track_id must name each track once, not {arrays['track_id'].tolist()}")
         if (np.diff(arrays["frame_index"]) <= 0).any():

@@ -80,6 +80,8 @@ def test_nothing_can_be_changed():
         ({"present": np.ones((2, 4), bool)}, r"present must have shape \(N, T\).* T is 3 in frame_index"),
         ({"keypoints_px": np.zeros((2, 3, 3, 3))}, "keypoints_px must have shape .* axis 3 should be 2"),
         ({"keypoint_names": ("bill", "nape")}, "keypoint_names"),
+        ({"skeleton": ((0, 1), (1, -1))}, "skeleton names keypoints outside 0…2"),
+        ({"skeleton": ((0, 3),)}, "skeleton names keypoints outside 0…2"),
         ({"track_id": [4.5, 9]}, "track_id must be of type int64"),
         ({"track_id": [4, 4]}, "each track once"),
         ({"frame_index": [10, 13, 11]}, "frame_index must increase"),
