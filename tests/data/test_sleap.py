@@ -76,6 +76,32 @@ def test_frames_of_a_package_name_its_videos_by_number_or_position(tmp_path, num
     assert read_observations(path).image_size_px[0].tolist() == [120, height]
 
 
+@pytest.mark.parametrize("labelled", [0, 1, 2])
+def test_packages_that_were_merged(tmp_path, labelled):
+    """The videos of the packages share the name of their data set; the frames name one of them."""
+    parts = project()
+    parts["frames"]["video"] = labelled
+    names = [f"/films/nest{i}.pkg.slp" for i in range(3)]
+    backends = [
+        {"filename": name, "dataset": "video0/video", "shape": [9, 100 + i, 120, 3]} for i, name in enumerate(names)
+    ]
+    parts["videos_json"] = [json.dumps({"backend": backend}) for backend in backends]
+    observed = read_observations(write_project(tmp_path / "merged.slp", parts))
+    assert observed.image_size_px[0].tolist() == [120, 100 + labelled]
+    assert observed.file_name[0] == f"nest{labelled}.pkg.slp#0"
+
+
+@pytest.mark.parametrize("frames", [T, 50])
+def test_a_trimmed_analysis_file_is_announced(tmp_path, caplog, frames):
+    """SLEAP may leave out the frames before the first bird and after the last one."""
+    path = write_analysis(tmp_path / "a.analysis.h5", ("track", "xy", "node", "frame"))
+    with h5py.File(path, "a") as file:
+        file.attrs["video_backend_metadata"] = json.dumps({"shape": [frames, 100, 120, 3]})
+    assert read_observations(path).frame_index.tolist() == list(range(T))
+    text = f"holds {T} rows for the 50 frames of its video; its first row is taken for frame 0"
+    assert (text in caplog.text) == (frames != T)
+
+
 def test_birds_without_a_track(tmp_path, caplog):
     """One bird per frame is one track; otherwise every bird is a track of its own."""
     parts = project()
