@@ -322,6 +322,7 @@ class _FineTuning:
             names = self.data.keypoint_names if self.network == "keypoints" else None
             sources.append(Source(self.scenes, draw, 1 - LABELLED_SHARE, names))
         mark = fingerprint(self.data, self.scenes, self.base, (self.network, self.schedule, self.seed))
+        part = " (2 of 2, on all labels)" if frames != FRAMES else " (1 of 2)" if self.data.holdout else ""
         return train(
             self.model,
             loss,
@@ -332,7 +333,7 @@ class _FineTuning:
             fingerprint=f"{mark} {frames}",
             score=score,
             progress=self.progress,
-            name=f"Training {self.network}" + ("" if frames == FRAMES else " on all labels"),
+            name=f"Training {self.network}" + part,
         )
 
     def _score(self) -> float:

@@ -24,6 +24,8 @@ from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
 from jaxfit.perception.network import OnnxModel, instance_of  # noqa: E402
 
 TIMES = range(0, 400, 50)
+started = []
+"""Names of the trainings in progress messages."""
 
 
 @pytest.fixture
@@ -41,8 +43,10 @@ def compared(tmp_path, monkeypatch):
     """
     file = write_labels(tmp_path / "labels", coco({t: [bird()] for t in TIMES}), list(TIMES))
     written = []
+    started.clear()
 
-    def training(model, *_others, **_options):
+    def training(model, *_others, **options):
+        started.append(options["name"])
         trained = {name: value + 1 for name, value in weights_of(model).items()}
         return Trained(10, [(0, 0.5), (5, 0.6), (10, 0.4)], trained, {})
 
@@ -88,6 +92,8 @@ def test_the_best_score_decides_what_is_written(compared, scores, chosen, longer
     assert result.chosen == chosen
     assert written[:-1] == [(fine_tune.CHECKED, 640, False), (fine_tune.CHECKED, 640, True)]
     assert written[-1] == ("mine.onnx", longer_side_px, is_trained)
+    second = ["Training segmenter (2 of 2, on all labels)"] * is_trained
+    assert started == ["Training segmenter (1 of 2)", *second]
 
 
 @pytest.mark.parametrize(
