@@ -121,6 +121,20 @@ def test_bones_and_coverage_are_measured(individuals, worlds):
     )
 
 
+def test_several_cameras_tell_place_and_size(window, worlds):
+    poses, scene = window.poses, replace(window, views=object())
+    values = worlds.measure(poses, scene, False)[0].values()
+    assert values["placed/length"] == pytest.approx(0, abs=1e-6)
+    length = np.linalg.norm(np.subtract((0, 9, 2.8), (0, -7.9, 0))) * poses.poses.scale[:, :1, None, None]
+    moved = poses.keypoints.cam + np.array([0, 0, 0.1]) * length
+    values = worlds.measure(poses.with_arrays(keypoints_cam=moved, scale=1.1 * poses.poses.scale), scene, False)[
+        0
+    ].values()
+    assert values["placed/length"] == pytest.approx(0.1, rel=0.03)  # the vertices of the keypoints lie a little beside
+    assert values["mpjpe/length"] == pytest.approx(0, abs=1e-6)
+    assert values["size_error"] == pytest.approx(0.1)  # although the place along the axis of the camera has changed
+
+
 def test_rotation_and_size_are_no_aligned_error(window, worlds):
     turn = Rotation.from_rotvec([0, 0, 0.3]).as_matrix()
     centre = window.poses.keypoints.cam.mean(2, keepdims=True)

@@ -18,10 +18,13 @@
    and the murre. Both models have only their common keypoints: nine (bill tip, eyes, nape, wingtips, feet, tail tip),
    and for the murre the 18 of AVES. Even where they share a name, the keypoints lie at different places of the bodies.
 
-Birds are individuals: in worlds 1, 2, 3 and 6 their bones differ by 5 % from those of the model, in world 3 also their
-shapes, and in world 1 the keypoints of the detector lie beside those of the model. With `equal`, all birds of these
-worlds have the body of the model, in the same motion. World 4 draws species, world 5 is real, and worlds 7 and 8 are
-without this choice.
+9. `murre_views`: murres that two, three or four of four calibrated cameras see, with simulated detections, and in the
+   last part four cameras with exact keypoints and masks. The cameras tell the size of a bird and its place.
+
+Birds are individuals: in worlds 1, 2, 3, 6 and 9 their bones differ by 5 % from those of the model, in world 3 also
+their shapes, and in worlds 1 and 9 the keypoints of the detector lie beside those of the model. With `equal`, all birds
+of these worlds have the body of the model, in the same motion. World 4 draws species, world 5 is real, and worlds 7 and
+8 are without this choice.
 
 In worlds 3, 4, 6, 7 and 8, every bird has an image of its own, so that no bird hides another bird.
 """
@@ -48,6 +51,8 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.masks import box_of_mask, decode_mask, encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
+from jaxfit.data.view_matching import match_birds
+from jaxfit.data.views import Views, birds_in_rows
 from jaxfit.fitting.initial_poses import InitialPoses, load_initial_poses
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
@@ -69,6 +74,7 @@ from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.individuals import draw_bones, draw_bones_of_prior, draw_offsets, draw_shape
 from jaxfit.simulation.noise import detect
+from jaxfit.simulation.rig import stage_rig
 from jaxfit.simulation.scene import simulate, stage_scene
 from jaxfit.simulation.species import random_pose, random_species
 
@@ -96,6 +102,8 @@ class Scene:
     """Initial poses for the config `aves`."""
     true_bird: Bird | None = None
     """The model of the true poses, with the same keypoints; None for the model of the fit."""
+    views: Views | None = None
+    """Several cameras, of which `observations` is the first; the true poses are in the frame of the first camera."""
 
 
 class World(NamedTuple):
@@ -133,6 +141,22 @@ def murre_pixels(seed: int, quick: bool, equal: bool) -> list[Scene]:
         scene = simulate(bird, Path(folder) / "scene", *((3, 20) if quick else (5, 60)), seed=seed, **bodies(equal))
         tracks = track_video(Path(folder) / "scene" / FOOTAGE, load_reconstruct_config().track)
     return [Scene(bird, tracks, scene.truth, scene.poses)]
+
+
+def murre_views(seed: int, quick: bool, equal: bool) -> list[Scene]:
+    """Draw a scene of murres that four cameras without distortion see."""
+    bird = load_murre()
+    rig = stage_rig(bird, 4, *((2, 20) if quick else (3, 60)), size=(1296, 760), seed=seed, **bodies(equal))
+    scenes = []
+    for part, count in {"2 views": 2, "3 views": 3, "4 views": 4, "4 views, exact": 4}.items():
+        cameras, staged = rig.cameras[:count], rig.scenes[:count]
+        tracks = [scene.truth if part.endswith("exact") else scene.detections for scene in staged]
+        matches = match_birds(cameras, tracks)
+        ids = range(1, matches.birds + 1)
+        rows = tuple(birds_in_rows(*each, ids) for each in zip(tracks, matches.bird, strict=True))
+        views = Views(cameras, cameras, rows)
+        scenes.append(Scene(bird, rows[0], staged[0].truth, staged[0].poses, part, views=views))
+    return scenes
 
 
 def published(kind: str, folder: str) -> Bird:
@@ -505,5 +529,6 @@ WORLDS = {
     6: World("windows of avian-mesh, 12 keypoints", avian_windows, "paper"),
     7: World("windows of AVES, individuals", aves_individuals, "paper"),
     8: World("windows of another model than that of the fit", other_models, "paper"),
+    9: World("murres, several cameras", murre_views, "paper"),
 }
 """The worlds by number."""

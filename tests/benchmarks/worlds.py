@@ -1,4 +1,4 @@
-"""Compare configs of the fit on eight worlds with known truth, with intervals and paired ratios over birds.
+"""Compare configs of the fit on nine worlds with known truth, with intervals and paired ratios over birds.
 
 A world is a kind of data (`world_scenes.py`). No number of a shipped config may be chosen on one world alone, and no
 shipped config may be significantly worse than `paper` (windows) or `aves` (pictures) in me_p, aligned 3D error or IoU
@@ -49,9 +49,11 @@ from jaxfit.evaluation.metrics import distances, procrustes_align
 from jaxfit.evaluation.spatial import best_scale, crop_rotation
 from jaxfit.evaluation.truth import Truth, match, match_tracks
 from jaxfit.fitting.fit import fit
+from jaxfit.fitting.initial_poses import InitialPoses
+from jaxfit.fitting.views import fit_views
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
-from jaxfit.foundation.progress import terminal
+from jaxfit.foundation.progress import ProgressTask, silent, terminal
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose, fold_bird
 
@@ -63,6 +65,7 @@ METRICS = {
     "aligned/length": ("aligned 3D %", 100, 3),
     "aligned": ("aligned 3D", 1, 4),
     "mpjpe/length": ("MPJPE %", 100, 3),
+    "placed/length": ("in place %", 100, 3),
     "iou": ("IoU", 1, 4),
     "pck@0.05": ("PCK@0.05", 1, 4),
     "size_error": ("size error %", 100, 2),
@@ -74,12 +77,13 @@ METRICS = {
 }
 """Metric → heading, factor, decimals. `aligned` is the PA-MPJPE of the keypoints in model units; `…/length` is a share
 of the rest distance from bill tip to tail tip. `bones %` is the error of the bone lengths, beside that of the mean bird
-of the model; `in 68 %` is the percentage of keypoints in space inside the 68 % region of the error bars."""
+of the model; `in 68 %` is the percentage of keypoints in space inside the 68 % region of the error bars. `in place
+%` is the error of the keypoints without any alignment, for several cameras, which tell place and size."""
 GATED = ("me_p", "aligned", "iou")
 """Metrics in which a shipped config may not be significantly worse than the reference."""
 MEASURED_PACKAGES = (
     *("config", "data", "evaluation", "fitting", "foundation", "model", "objective", "perception", "raster"),
-    *("simulation", "video"),
+    *("cameras", "simulation", "video"),
 )
 """Packages whose content decides whether a stored run is still valid."""
 
@@ -139,7 +143,8 @@ def errors_3d(solution: Solution, scene: Scene, pictures: bool) -> dict[str, Flo
     """Return the 3D errors of the keypoints of every bird and frame, as `BirdSums.of` takes them.
 
     `SpatialErrors` defines the errors. There the points are joints, and joints of other species cannot be compared.
-    Here the points are keypoints. The factor of the size belongs to a track, and for pictures to a frame.
+    Here the points are keypoints. The factor of the size belongs to a track, and for pictures to a frame. With several
+    cameras, the size is the rest length itself, not the apparent size, and errors without alignment are added.
 
     Args:
         solution: a result with the track ids of the truth.
@@ -155,6 +160,7 @@ def errors_3d(solution: Solution, scene: Scene, pictures: bool) -> dict[str, Flo
         solution.crops.square_px[..., :2] + solution.crops.square_px[..., 2:] / 2, [x0 + side / 2, y0 + side / 2], focal
     )
     p, q = solution.keypoints.cam.astype(np.float64), truth.keypoints.cam[n, t].astype(np.float64)
+    placed = distances(p, q, np.broadcast_to(measured[..., None], p.shape[:-1]))
     depth_p, depth_q = p[..., 2].mean(-1), q[..., 2].mean(-1)
     p = (p - p.mean(2, keepdims=True)) @ np.swapaxes(R, -1, -2)
     q = q - q.mean(2, keepdims=True)
@@ -167,9 +173,12 @@ def errors_3d(solution: Solution, scene: Scene, pictures: bool) -> dict[str, Flo
     direct, aligned = distances(p, q, counted), distances(procrustes_align(p, q, counted), q, counted)
     focal_p = solution.crops.focal_px * solution.crops.square_px[..., 2] / solution.crops.crop_px
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = (rest_length(bird, solution.poses) * focal_p / depth_p) / (length * focal / depth_q)
+        ratio = rest_length(bird, solution.poses) / length
+        if scene.views is None:
+            ratio = ratio * (focal_p / depth_p) / (focal / depth_q)
     ratio = np.where(measured, ratio, np.nan)[..., None]
     return {
+        **({} if scene.views is None else {"placed/length": placed / length[..., None]}),
         "mpjpe/length": direct / length[..., None],
         "aligned": aligned,
         "aligned/length": aligned / length[..., None],
@@ -235,15 +244,22 @@ def run(scenes: Sequence[Scene], config: Config, pictures: bool, compiled: set[A
         key = config.key, scene.bird.name, scene.part, scene.observations.present.shape
         if key not in compiled:
             one_step = tuple(dataclasses.replace(stage, steps=1) for stage in config.config.stages)
-            fit(scene.observations, scene.bird, dataclasses.replace(config.config, stages=one_step), init)
+            fitted(scene, dataclasses.replace(config.config, stages=one_step), init)
             compiled.add(key)
         start = time.perf_counter()
-        solution = fit(scene.observations, scene.bird, config.config, init, terminal)
+        solution = fitted(scene, config.config, init, terminal)
         seconds = time.perf_counter() - start
         sums, missing = measure(solution, scene, pictures)
         sums = dataclasses.asdict(sums)
         results.append({"part": scene.part, "sums": sums, "seconds": seconds, "missing": missing})
     return results
+
+
+def fitted(scene: Scene, config: FitConfig, init: InitialPoses | None, progress: ProgressTask = silent) -> Solution:
+    """Fit a scene, of one camera or of several."""
+    if scene.views is not None:
+        return fit_views(scene.views, scene.bird, config, progress)
+    return fit(scene.observations, scene.bird, config, init, progress)
 
 
 def pooled(results: Sequence[tuple[str, BirdSums]]) -> BirdSums:
