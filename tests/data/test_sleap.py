@@ -229,6 +229,33 @@ def test_hostile_hdf5(tmp_path, case):
         read_observations(path, size_px=SIZE)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("tracks", np.zeros((2, 3, 4))),
+        ("tracks", np.zeros((1, 2, 2, 3, 4))),
+        ("tracks", np.zeros((2, 3, 3, 4))),
+        ("tracks", np.zeros((2, 2, 3, 0))),
+        ("tracks", np.array([b"a", b"b"])),
+        ("node_names", np.array([b"a"])),
+        ("node_names", np.array([b"a", b"b", b"\xff"])),
+        ("track_names", np.array([b"x"])),
+        ("point_scores", np.zeros((1, 2))),
+        ("instance_scores", np.zeros(3)),
+        ("edge_inds", np.array([[0, 99]])),
+    ],
+)
+def test_an_analysis_file_of_other_shapes(tmp_path, name, value):
+    path = write_analysis(tmp_path / "a.analysis.h5")
+    with h5py.File(path, "a") as file:
+        if name in file:
+            del file[name]
+        file[name] = value
+    with pytest.raises(InputError, match=r"a\.analysis\.h5: is not an .* that can be read") as error:
+        read_observations(path, size_px=SIZE)
+    assert str(error.value).isprintable()
+
+
 def test_a_damaged_heap_of_texts_ends_with_an_error(tmp_path):
     """The HDF5 library never returns from an object without a size."""
     path = write_analysis(tmp_path / "a.h5", ("track", "xy", "node", "frame"))

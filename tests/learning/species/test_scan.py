@@ -86,6 +86,10 @@ def test_keypoints_may_be_vertex_numbers_or_picked_points(tmp_path):
     [
         ('{"bill_tip": 1, "tail_tip": 2, "crown": 3}', "3 keypoints of the model"),
         ('{"bill_tip": 99, "tail_tip": 2, "crown": 3, "nape": 1}', "outside 0…9"),
+        (
+            '{"bill_tip": 18446744073709551616, "tail_tip": 2, "crown": 3, "nape": 1}',
+            "vertex 18446744073709551616 is outside",
+        ),
         ('{"bill_tip": "a", "tail_tip": 2, "crown": 3, "nape": 1}', "is not a point"),
         ('{"bill_tip": [1, 2, 1e300], "tail_tip": 2, "crown": 3, "nape": 1}', r"bill_tip is a point beyond 1e\+09"),
         ('{"bill_tip": [1, 2, NaN], "tail_tip": 2, "crown": 3, "nape": 1}', "is not a point"),
