@@ -201,6 +201,8 @@ def test_written_scene_is_read_back(tmp_path):
         {"seed": -1},
         {"fps": 0.0},
         {"fps": float("nan")},
+        {"bone_sd": 0.5},
+        {"keypoint_offset": -0.01},
     ],
 )
 def test_invalid_arguments_are_rejected(wrong, tmp_path):
