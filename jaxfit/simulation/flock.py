@@ -16,7 +16,7 @@ from jaxfit.model.kinematics import Pose, fold_bird, window_joints, window_trans
 from jaxfit.model.murre import POSTURES
 from jaxfit.model.rotation import unwrap_axis_angle
 from jaxfit.simulation.behaviour import JAB_DISTANCE, Key, Keyframes, Motion, interpolate_keyframes
-from jaxfit.simulation.individuals import draw_bones
+from jaxfit.simulation.individuals import draw_bones, draw_shape
 from jaxfit.simulation.viewpoint import Viewpoint
 
 FRAMES_PER_KNOT = 20.0
@@ -241,14 +241,13 @@ class _Body:
             * Rotation.from_rotvec((motion.pitch + lean[:, 0])[:, None] * [1, 0, 0])
             * Rotation.from_rotvec(lean[:, 1:2] * [0, 1, 0])
         )
-        variance = np.asarray(bird.shape_variance, np.float64)
         pose = Pose(
             global_orient=jnp.asarray(self.R_world_root.as_rotvec(), jnp.float32),
             body_pose=jnp.asarray(self.body_pose, jnp.float32),
             transl=jnp.zeros((frames, 3)),
             scale=jnp.full(1, rng.normal(1, 0.03), jnp.float32),
             bone_length=jnp.asarray(bone_length),
-            betas=jnp.asarray(0.7 * np.sqrt(variance) * rng.normal(size=len(variance)), jnp.float32),
+            betas=jnp.asarray(draw_shape(bird, rng)),
         )
         self.pose = pose
         rig = fold_bird(bird)
