@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from jaxfit.data.solution import Solution
     from jaxfit.data.views import Views
     from jaxfit.evaluation.truth import Truth
+    from jaxfit.fitting.bodies import Body
     from jaxfit.model.bird import Bird
 
 
@@ -65,13 +66,16 @@ def fit(options: argparse.Namespace) -> None:
         raise InputError(options.observations, "holds photographs, which show no common ledge", "leave out --ledge")
     config = _fewer_keypoints(config, names, options)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
+    bodies = _known_bodies(options, config, observations.track_id.tolist())
     read_s = time.perf_counter() - start
     with open_cluster(options.workers, options.scheduler) as cluster:
         source, learnt = options.observations, None
         if config.learn_weights:
             learnt = learn_weights(observations, bird, config, initial_poses, terminal, source)
             config = learnt.config
-        solution = fit(observations, bird, config, initial_poses, terminal, source=source, cluster=cluster)
+        solution = fit(
+            observations, bird, config, initial_poses, terminal, source=source, cluster=cluster, bodies=bodies
+        )
     seconds = {"read": read_s, "fit": time.perf_counter() - start - read_s}
     subject, facts = counted(len(solution.track_id), "track"), {}
     if observations.photographs:  # every bird has a photograph of its own
@@ -79,6 +83,27 @@ def fit(options: argparse.Namespace) -> None:
         photographs = counted(observations.photographs, "photograph")
         subject = f"{counted(len(solution.track_id), 'bird')} in {photographs}"
     _write_fit(options, config, bird, solution, None, seconds, facts, subject, learnt and learnt.to_yaml())
+
+
+def _known_bodies(options: argparse.Namespace, config: FitConfig, tracks: list[int]) -> dict[int, Body] | None:
+    """Return the bodies of the result that the options name.
+
+    Raises:
+        InputError: the result has no bodies, or none of these tracks, or the config uses no bodies.
+    """
+    from jaxfit.data.solution import load_solution
+    from jaxfit.fitting.bodies import bodies_of
+
+    if options.body is None:
+        return None
+    if not any(stage.share_body for stage in config.stages):
+        problem = "has no stage that uses the body of a bird"
+        raise InputError(f"config {options.config}", problem, "choose a config with `share_body`, such as `map`")
+    bodies = bodies_of(load_solution(options.body)[0], config)
+    if not bodies.keys() & set(tracks):
+        known = f"has the bodies of tracks {sorted(bodies)}" if bodies else "has no bodies"
+        raise InputError(options.body, known, f"give a result with bodies of tracks {tracks}")
+    return bodies
 
 
 def _write_fit(
@@ -182,9 +207,11 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
         facts["measured_length_cm"] = round(length_cm, 2)
         show(f"model {bird.name} has no unit of length: measured by the cameras, bill to tail {length_cm:.1f} cm")
     bird = measured
+    tracks = np.unique(np.concatenate([own.track_id for own in read.views.observations])).tolist()
+    bodies = _known_bodies(options, config, tracks)
     read_s = time.perf_counter() - start
     with open_cluster(options.workers, options.scheduler) as cluster:
-        solution = fit_views(read.views, bird, config, terminal, source, cluster)
+        solution = fit_views(read.views, bird, config, terminal, source, cluster, bodies)
     seconds = {"read": read_s, "fit": time.perf_counter() - start - read_s}
     lenses, matches = read.views.lenses, read.matches
     matched = {

@@ -297,6 +297,8 @@ def _fit(command: Parser) -> None:
     group.add_argument("--ledge", nargs="?", const="birds", metavar="PLANE", help=text)
     add_shared(group, "--focal-px")
     group = command.add_argument_group("start and speed of the fit")
+    text = "result that knows the bodies of the birds; tracks of the same number keep their body"
+    group.add_argument("--body", type=Path, metavar="RESULT", help=text)
     text = "initial poses: the output of a pose regressor, or an earlier poses.npz"
     group.add_argument("--init", type=Path, metavar="POSES.npz", help=text)
     add_cluster(group)

@@ -141,6 +141,9 @@ class StageConfig:
     """Whether Adam starts with the moments of the previous stage instead of zeros."""
     keep_best: bool = False
     """Whether only the best hypothesis of each bird continues after this stage."""
+    share_body: bool = False
+    """Whether the bone lengths and the shape that this stage optimises in every window become one body for each track
+    (docs/method/bodies.md). The later stages keep the body."""
 
     def __post_init__(self):
         for name in self.terms:
@@ -215,6 +218,17 @@ class FitConfig:
         for name, offset in self.keypoint_offsets.items():
             problem = f"has {len(offset)} numbers"
             require(len(offset) == 3, f"keypoint_offsets.{name}", problem, "expected three: x, y, z")
+        shared = [i for i, stage in enumerate(self.stages) if stage.share_body]
+        for i in shared:
+            at = f"stages[{i}].share_body"
+            last = i == shared[-1] and i < len(self.stages) - 1
+            require(last, at, "is true", "expected one such stage, and a later stage")
+            has_body = {"bone_length", "betas"} & set(self.stages[i].optimised)
+            require(bool(has_body), at, "is true", "the stage must optimise bone_length or betas")
+            later = [stage for stage in self.stages[i + 1 :] if {"bone_length", "betas"} & set(stage.optimised)]
+            require(not later, at, "is true", "later stages must not optimise bone_length or betas")
+            adam = self.stages[i].solver == "adam" or self.stages[i + 1].carry_moments
+            require(not adam, at, "is true", "the stage must use Levenberg-Marquardt")
         for i, stage in enumerate(self.stages):
             if stage.carry_moments:
                 adam = stage.solver == self.stages[max(i - 1, 0)].solver == "adam"

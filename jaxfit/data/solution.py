@@ -25,10 +25,10 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.kinematics import Pose
 
-FORMAT_VERSION = 8
-"""Version of ``poses.npz``; increased when its arrays change. Version 7 lacks `contact`, version 6 also `World`,
-version 5 also `doubts`, version 4 also `ErrorBars`, version 3 also `ambiguity_deg`, version 2 also `timestamp_s` and
-`fps`."""
+FORMAT_VERSION = 9
+"""Version of ``poses.npz``; increased when its arrays change. Version 8 lacks `Bodies`, version 7 also `contact`,
+version 6 also `World`, version 5 also `doubts`, version 4 also `ErrorBars`, version 3 also `ambiguity_deg`, version 2
+also `timestamp_s` and `fps`."""
 _OLDEST_VERSION = 2
 """Older versions are not read."""
 
@@ -124,6 +124,23 @@ class World(_Arrays):
     """Keypoints in the world, metres."""
 
 
+@dataclass(frozen=True, eq=False)
+class Bodies(_Arrays):
+    """One body for each track, from all its windows (`fitting/bodies.py`); NaN for tracks without a fitted window."""
+
+    bone_length: Float32[np.ndarray, "N bones"]
+    """Relative to the rest skeleton."""
+    bone_length_sd: Float32[np.ndarray, "N bones"]
+    """0 where bone lengths are fixed."""
+    betas: Float32[np.ndarray, "N S"]
+    betas_sd: Float32[np.ndarray, "N S"]
+    """0 where the shape is fixed."""
+    frames: Float32[np.ndarray, "N"]
+    """Number of independent frames that the data of the track are worth."""
+    determined: Float32[np.ndarray, "N"]
+    """How many of the numbers of the body the data determine; 0: the body is that of the model."""
+
+
 def layout_of(record: type) -> dict[str, tuple[str, Any]]:
     """Return field → (shape, dtype) of a record, from its annotations, as `validate_arrays` expects it."""
     scalars = {float: ("", np.float64), int: ("", np.int64)}
@@ -144,11 +161,13 @@ _GROUPS: dict[str, Any] = {
     "flags": Flags,
     "error_bars": ErrorBars,
     "world": World,
+    "bodies": Bodies,
 }
-_OPTIONAL = ("error_bars", "world")
+_OPTIONAL = ("error_bars", "world", "bodies")
 _OTHER_NAMES = {("keypoints", "cam"): "keypoints_cam", ("keypoints", "px"): "keypoints_px"} | {
     ("crops", "square_px"): "crop"
 }
+_OTHER_NAMES |= {("bodies", name): f"body_{name}" for name in layout_of(Bodies)}
 PLACES = {
     _OTHER_NAMES.get((group, name), name): (group, name) for group in _GROUPS for name in layout_of(_GROUPS[group])
 }
@@ -174,7 +193,8 @@ LAYOUT: dict[str, tuple[str, Any]] = {
     "status": ("N", np.str_),
 }
 """The arrays of every ``poses.npz``."""
-ERROR_BARS, WORLD, LEDGE = _group_layout("error_bars"), _group_layout("world"), {"contact": ("N T", np.float32)}
+ERROR_BARS, WORLD, BODIES = (_group_layout(name) for name in _OPTIONAL)
+LEDGE = {"contact": ("N T", np.float32)}
 """The arrays that a ``poses.npz`` may have."""
 
 
@@ -228,6 +248,8 @@ class Solution:
     """Error bars; None without."""
     world: World | None = None
     """Poses in the world; None for a fit in no world."""
+    bodies: Bodies | None = None
+    """The bodies of the birds; None for a fit without a stage that shares the body."""
     contact: np.ndarray | None = None
     """(N, T) float32: probability that the bird stands on the ledge z = 0. None: no ledge is known."""
 
@@ -288,8 +310,9 @@ class Solution:
 
     @property
     def optional_layout(self) -> dict[str, tuple[str, Any]]:
-        """The entries of `ERROR_BARS`, `WORLD` and `LEDGE` that the solution has."""
-        optional = ((self.error_bars, ERROR_BARS), (self.world, WORLD), (self.contact, LEDGE))
+        """The entries of `ERROR_BARS`, `WORLD`, `BODIES` and `LEDGE` that the solution has."""
+        optional = ((getattr(self, group), _group_layout(group)) for group in _OPTIONAL)
+        optional = (*optional, (self.contact, LEDGE))
         return {name: entry for value, layout in optional if value is not None for name, entry in layout.items()}
 
     def cells(self, error_bars: bool | None = None) -> dict[str, np.ndarray]:
@@ -348,7 +371,7 @@ def _typed(values: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: an array has another type or shape.
     """
-    layout = LAYOUT | ERROR_BARS | WORLD | LEDGE
+    layout = LAYOUT | ERROR_BARS | WORLD | BODIES | LEDGE
     arrays: dict[str, Any] = validate_arrays(values, {name: layout[name] for name in layout if name in values})
     arrays |= {name: tuple(arrays[name].tolist()) for name in _NAMES if name in arrays}
     numbers = {"focal_px": float, "crop_px": int}
@@ -510,7 +533,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     folder = check_folder(folder, "a folder of results", _WRITTEN_BY)
     path = check_readable(folder / POSES, "an .npz file", _WRITTEN_BY)
     shapes = {name: shape for name, (shape, _) in LAYOUT.items()} | {"loss": "N L", "loss_terms": "L"}
-    optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | LEDGE).items()}
+    optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | BODIES | LEDGE).items()}
     optional |= {name: shapes.pop(name) for name in ("ambiguity_deg", "doubts")}
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
     terms, loss = arrays.pop("loss_terms"), arrays.pop("loss")

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfit.config.fit import FitConfig, StageConfig
+from jaxfit.fitting.bodies import BodyEvidence, body_evidence, stages_of_pass
 from jaxfit.fitting.diagnose import name_failures
 from jaxfit.fitting.error_bars import ErrorBars, window_error_bars
 from jaxfit.fitting.hypotheses import Hypotheses, compare_hypotheses, split_rows
@@ -25,6 +26,7 @@ from jaxfit.fitting.solve import (
     begin,
     needs_mask,
     report,
+    shared_parameters,
     stage_hyperparameters,
     stage_program,
 )
@@ -67,6 +69,10 @@ class Batch(NamedTuple):
     pose_row: Int[np.ndarray, "B"]
     """Row of each problem's initial pose. Problems that share an initial pose must share their targets, too. They are
     computed as one problem until a stage gives them different hyperparameters."""
+    ambiguity_deg: Float[np.ndarray, "S T"] | None = None
+    """Of each initial pose, from earlier stages; None for the first stage."""
+    body_covariance: Float[np.ndarray, "S P P"] | None = None
+    """Of the body that each initial pose has (`fitting/bodies.py`); None without given bodies."""
 
 
 class FittedWindow(NamedTuple):
@@ -85,12 +91,17 @@ class FittedWindow(NamedTuple):
     """As `Solution.flags.ambiguity_deg`."""
     error_bars: ErrorBars | None = None
     """None if the config has none."""
+    body: BodyEvidence | None = None
+    """What the window says about the body of its bird; None if the last stage of the config shares no body."""
 
 
 def fit_batch(
     model: FitModel, configs: Sequence[FitConfig], batch: Batch, report_progress: ReportProgress
 ) -> FittedWindow:
-    """Run all stages on a batch of problems. The result of a problem does not depend on the other problems.
+    """Run the stages on a batch of problems. The result of a problem does not depend on the other problems.
+
+    If a stage shares the body (`share_body`), the stages up to this stage run for a batch without given bodies, and
+    the later stages for a batch with bodies.
 
     Args:
         model: the bird and the camera.
@@ -101,12 +112,16 @@ def fit_batch(
     Returns:
         The results of all problems, with a leading axis B, in the order of the batch.
     """
-    initial, last = batch.initial_pose, len(configs[0].stages) - 1
+    initial, stages = batch.initial_pose, stages_of_pass(configs[0], batch.body_covariance is not None)
+    last = stages[-1]
     count, hypotheses, frames = initial.global_orient.shape[:3]
     pose = jax.tree.map(lambda x: np.asarray(x).reshape(count * hypotheses, *x.shape[2:]), initial)
     failure, ambiguity_deg = np.full(len(pose.transl), "", object), np.zeros((len(pose.transl), frames), np.float32)
+    if batch.ambiguity_deg is not None:
+        ambiguity_deg = np.repeat(batch.ambiguity_deg, hypotheses, axis=0)
     rows = Hypotheses(pose, None, failure, ambiguity_deg, batch.pose_row, hypotheses)
-    for i, stage in enumerate(configs[0].stages):
+    for i in stages:
+        stage = configs[0].stages[i]
         program = stage_program(configs[0], stage, model)
         hyperparameters = [stage_hyperparameters(c, c.stages[i], model.bird.keypoint_names) for c in configs]
         rows, first = split_rows(rows, batch.config, hyperparameters)
@@ -121,13 +136,22 @@ def fit_batch(
             rows = _name_failures(run, rows, step)
         rows, best = compare_hypotheses(rows, final.loss, batch.targets.present[batch.targets_row[first]])
         rows, final = rows.rows(best, count=1), jax.tree.map(lambda x, best=best: x[best], final)
-    bars = None
-    if configs[0].error_bars:
-        program = with_shared(program, stage)
+    bars = body = None
+    if stage.share_body:
         run = _stage_run(stage, program, rows, hyperparameters, batch, first)
-        bars = _error_bars(run, rows, configs[0].common_size)
+        parts = [body_evidence(program, p, take_tile(rows.pose, tile)) for p, tile in run.tiles]
+        body = run.joined(jax.tree.map(lambda *x: np.stack(x), *part) for part in parts)
+    elif configs[0].error_bars:
+        covariance, used = None, stage
+        if batch.body_covariance is not None:
+            names = shared_parameters(configs[0].stages[stages[0] - 1])
+            covariance = batch.body_covariance[batch.pose_row[first]]
+            used = replace(stage, optimised=(*stage.optimised, *names))
+            hyperparameters = [stage_hyperparameters(c, used, model.bird.keypoint_names) for c in configs]
+        run = _stage_run(used, with_shared(program, used), rows, hyperparameters, batch, first)
+        bars = _error_bars(run, rows, configs[0].common_size, covariance)
     fitted = FittedWindow(
-        rows.pose, final.loss, final.keypoints_cam, final.keypoints_px, rows.failure, rows.ambiguity_deg, bars
+        rows.pose, final.loss, final.keypoints_cam, final.keypoints_px, rows.failure, rows.ambiguity_deg, bars, body
     )
     return jax.tree.map(lambda x: x[rows.row], fitted)
 
@@ -213,11 +237,14 @@ def _name_failures(run: _StageRun, rows: Hypotheses, step: Int[np.ndarray, "RH"]
     return rows._replace(failure=failure)
 
 
-def _error_bars(run: _StageRun, rows: Hypotheses, common_size: bool) -> ErrorBars:
+def _error_bars(
+    run: _StageRun, rows: Hypotheses, common_size: bool, body_covariance: Float[np.ndarray, "R P P"] | None
+) -> ErrorBars:
     """Return the error bars of all rows, and log why a row that did not diverge has none."""
     parts = []
     for p, tile in run.tiles:
-        bars, reasons = window_error_bars(run.program, p, take_tile(rows.pose, tile), common_size)
+        of_bodies = None if body_covariance is None else take_tile(body_covariance, tile)
+        bars, reasons = window_error_bars(run.program, p, take_tile(rows.pose, tile), common_size, of_bodies)
         parts.append(jax.tree.map(lambda *x: np.stack(x), *bars))
         for row, reason in zip(tile.tolist(), reasons, strict=True):
             if row >= 0 and reason and not rows.failure[row]:

@@ -14,6 +14,10 @@ The posterior (`fitting/posterior.py`) is a Gaussian over the columns of a frame
 Assumptions: the covariance is not H⁻¹ alone. `fitting/sandwich.py` adds what a pose that deviates from the pose prior
 in the whole window does to the fit, and what errors of keypoints do that agree between frames.
 
+Body: bone lengths and shape that the whole track gives (`fitting/bodies.py`) have errors with a covariance Σ_b, which
+the fitted pose follows with the derivative S by the body. The covariance of pose and body together is therefore
+[C + S·Σ_b·Sᵀ, S·Σ_b; Σ_b·Sᵀ, Σ_b], with the covariance C of the pose for a known body.
+
 Misfit: if the keypoints lie farther from the fitted pose than the objective assumes, the posterior is too narrow. The
 noise, and H⁻¹ with it, is multiplied by one factor for a window, the ratio of the median squared standardised residual
 to its expected median, if this is above 1. A residual is standardised by the scale of its likelihood and by its
@@ -35,7 +39,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit.data.solution import ERROR_BARS
-from jaxfit.fitting.posterior import Posterior, window_posteriors
+from jaxfit.fitting.posterior import BodySensitivity, Posterior, window_posteriors
 from jaxfit.fitting.problem import Problem, Program
 from jaxfit.fitting.sandwich import (
     constant_deviation,
@@ -140,7 +144,11 @@ def blend_error_bars(
 
 
 def window_error_bars(
-    program: Program, problems: Problem, pose: Pose, common_size: bool
+    program: Program,
+    problems: Problem,
+    pose: Pose,
+    common_size: bool,
+    body_covariance: Float[np.ndarray, "B P P"] | None = None,
 ) -> tuple[list[ErrorBars], list[str]]:
     """Return the error bars of each of B problems of a stage at its fitted pose, and the reason why it has none.
 
@@ -149,11 +157,14 @@ def window_error_bars(
         problems: B problems.
         pose: their fitted poses.
         common_size: as in the config.
+        body_covariance: covariances of the bodies, which the problems optimise as shared parameters; None for windows
+            without a given body.
 
     Returns:
         The error bars, and for each problem a reason, which is empty if it has error bars.
     """
-    posteriors = window_posteriors(program, problems, pose)
+    numbers = 0 if body_covariance is None else body_covariance.shape[-1]
+    posteriors = window_posteriors(program, problems, pose, numbers)
     keypoints = jax.tree.map(np.asarray, _keypoints_and_derivatives(program, problems, pose))
     pose, problems = jax.tree.map(np.asarray, (pose, problems))
     bars, reasons = [], []
@@ -164,7 +175,8 @@ def window_error_bars(
             bars.append(no_error_bars(len(one.transl), *sizes))
             reasons.append(posterior)
             continue
-        bars.append(_error_bars(program, problem, one, posterior, own, common_size))
+        of_body = None if body_covariance is None else np.asarray(body_covariance[b], np.float64)
+        bars.append(_error_bars(program, problem, one, posterior, own, common_size, of_body))
         reasons.append("")
     return bars, reasons
 
@@ -193,7 +205,13 @@ def _keypoints_and_derivatives(program: Program, problems: Problem, pose: Pose) 
 
 
 def _error_bars(
-    program: Program, problem: Problem, pose: Pose, window: Posterior, keypoints: _Keypoints, common_size: bool
+    program: Program,
+    problem: Problem,
+    pose: Pose,
+    window: Posterior,
+    keypoints: _Keypoints,
+    common_size: bool,
+    body_covariance: Float[np.ndarray, "P P"] | None,
 ) -> ErrorBars:
     """Return the error bars of one window."""
     T, _, _, D = keypoints.derivative.shape
@@ -202,6 +220,10 @@ def _error_bars(
     points, by_cam = np.asarray(keypoints.points_cam, np.float64), np.array(keypoints.derivative, np.float64)
     points_px, by_px = _in_views(program, problem, points, by_cam[..., columns])
     covariance, misfit = _covariance(program, problem, window, points_px, by_px)
+    if window.body is not None and body_covariance is not None:
+        covariance = _with_body(covariance, window.body, body_covariance)
+        columns = np.concatenate([columns, window.body.columns])
+        by_px = _in_views(program, problem, points, by_cam[..., columns])[1]
     by_transl, scale = np.zeros((T, 3, D)), np.broadcast_to(pose.scale, T).astype(np.float64)
     by_transl[:, :, 3 * bones + 3 : 3 * bones + 6] = np.eye(3)
     at_scale = 3 * bones + 6
@@ -239,6 +261,17 @@ def _error_bars(
         value[~present] = np.nan
         found[name] = value.astype(np.float32)
     return ErrorBars(**found)
+
+
+def _with_body(
+    covariance: Float[np.ndarray, "T Q Q"], slopes: BodySensitivity, of_body: Float[np.ndarray, "P P"]
+) -> Float[np.ndarray, "T Q+P Q+P"]:
+    """Return the covariance of pose and body, from that of the pose for a known body and that of the body."""
+    T, (C, P) = len(slopes.own), slopes.shared.shape
+    S = np.concatenate([slopes.own, np.broadcast_to(slopes.shared, (T, C, P))], axis=1)
+    cross = S @ of_body
+    both = np.broadcast_to(of_body, (T, P, P))
+    return np.block([[covariance + cross @ S.swapaxes(1, 2), cross], [cross.swapaxes(1, 2), both]])
 
 
 def _propagate(J: Float[np.ndarray, "T K R P"], covariance: Float[np.ndarray, "T P P"]) -> np.ndarray:

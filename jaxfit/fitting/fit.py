@@ -6,7 +6,7 @@ The data passes each step once: observations → windows → targets and initial
 from __future__ import annotations
 
 import logging
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -19,6 +19,7 @@ from jaxfit.data.flags import with_doubts
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import bytes_per_frame
+from jaxfit.fitting.bodies import Body, body_arrays, known_rows
 from jaxfit.fitting.collect import blend_seams, collect_windows
 from jaxfit.fitting.crops import square_images
 from jaxfit.fitting.diagnose import check_terms
@@ -90,6 +91,7 @@ def fit(
     source: object = "observations",
     stored: StoredWindows | None = None,
     cluster: Cluster | None = None,
+    bodies: Mapping[int, Body] | None = None,
 ) -> Solution:
     """Fit the poses of all birds of a video (or of a set of photographs).
 
@@ -102,6 +104,7 @@ def fit(
         source: name of the observations in error messages.
         stored: receives every fitted window, and holds the windows of an interrupted fit, which are not fitted again.
         cluster: worker processes that fit the windows. None: this process.
+        bodies: track id → known body of a bird (`fitting.bodies.bodies_of`). Other bodies are estimated.
 
     Returns:
         The poses, and the status of every track: `ok`, `partly diverged`, `diverged` or `no usable frame`. A window
@@ -114,7 +117,10 @@ def fit(
     """
     if config.learn_weights:
         config = learn_weights(observations, bird, config, initial_poses, progress, source).config
-    return fit_runs(observations, bird, [config], initial_poses, progress, source, stored=stored, cluster=cluster)[0]
+    several = fit_runs(
+        observations, bird, [config], initial_poses, progress, source, stored=stored, cluster=cluster, bodies=bodies
+    )
+    return several[0]
 
 
 def learn_weights(
@@ -158,13 +164,15 @@ def fit_runs(
     select: Int[np.ndarray, "rows"] | None = None,
     stored: StoredWindows | None = None,
     cluster: Cluster | None = None,
+    bodies: Mapping[int, Body] | None = None,
 ) -> list[Solution]:
     """Fit the same birds under several configs at once, with one compiled program.
 
     Args:
         configs: configs with an equal `stages.compiled_part`.
         select: rows of the windows (`windows_of`) that are fitted; None fits all. Other windows have no valid pose.
-        observations, bird, initial_poses, progress, source, stored, cluster: as for `fit`; `stored` is for one config.
+        observations, bird, initial_poses, progress, source, stored, cluster, bodies: as for `fit`; `stored` is for one
+            config.
 
     Returns:
         The solution of every config.
@@ -192,17 +200,19 @@ def fit_runs(
         windows = [each[select] for each in windows]
     # each problem is one window of one run
     problems = [(r, w) for r, some in enumerate(windows) for w in range(len(some))]
-    results = {} if stored is None else {(0, w): result for w, result in stored.find(windows[0]).items()}
-    task = FitTask(list(configs), windows, [problem for problem in problems if problem not in results])
+    task = FitTask(list(configs), windows, problems)
     birds = len(np.unique(windows[0].track))
     subject = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
-    results |= fit_windows(task, model, observations.num_tracks, subject, progress, stored, cluster)
+    known = known_rows(bodies, observations.track_id)
+    results, found = fit_windows(task, model, observations.num_tracks, subject, progress, stored, cluster, known)
     solutions = []
     for r, (config, some) in enumerate(zip(configs, windows, strict=True)):
         fitted = [results.pop((r, w)) for w in range(len(some))]
         if config.overlap_frames:
             fitted = blend_seams(some, fitted, model)
         solution = collect_windows(observations, some, fitted, bird, model.camera, config.common_size, skipped)
+        if found[r]:
+            solution = solution.with_arrays(**body_arrays(found[r], observations.num_tracks, bird, config))
         solutions.append(with_doubts(solution, observations, bird, progress))
     return solutions
 

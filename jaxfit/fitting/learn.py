@@ -125,7 +125,9 @@ def learn(
         progress: shows progress.
         source: name of the observations in messages.
     """
-    first, remarks = replace(config, learn_weights=()), []
+    # the sample is fitted in one pass, with a body for each window
+    one_pass = tuple(replace(stage, share_body=False) for stage in config.stages)
+    first, remarks = replace(config, learn_weights=(), stages=one_pass), []
     some = windows[choose_windows(windows, frames_per_batch(model.bird, config) // config.window)]
     names = _learnable(config, some, remarks)
     values: dict[str, Value] = {}

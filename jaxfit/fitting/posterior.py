@@ -295,6 +295,17 @@ class Posterior(NamedTuple):
     """H, with the broad prior."""
     factors: Factors
     """The factorisation of H."""
+    body: BodySensitivity | None = None
+    """How the parameters depend on a body that is given; None for a body that is fixed or optimised."""
+
+
+class BodySensitivity(NamedTuple):
+    """Derivatives of the fitted parameters by the P numbers of a given body, and the columns of the body."""
+
+    own: Float[np.ndarray, "T L P"]
+    shared: Float[np.ndarray, "C P"]
+    columns: Float[np.ndarray, "P"]
+    """Positions of the columns of the body."""
 
 
 def optimised_columns(program: Program, step_size: Pose, pose: Pose) -> Columns:
@@ -383,11 +394,13 @@ def window_blocks(
     return found
 
 
-def window_posteriors(program: Program, problems: Problem, pose: Pose) -> list[Posterior | str]:
+def window_posteriors(program: Program, problems: Problem, pose: Pose, body: int = 0) -> list[Posterior | str]:
     """Return the posterior of each of B problems of a stage at its fitted pose, or the reason why it has none.
 
     Args:
         program, problems, pose: as for `window_blocks`.
+        body: number of the last shared parameters that are given, as numbers of a body. The posterior is that of the
+            other parameters for this body, with their derivatives by the body.
 
     Raises:
         InputError: a term has no curvature; the error names the term.
@@ -397,7 +410,22 @@ def window_posteriors(program: Program, problems: Problem, pose: Pose) -> list[P
     def broad(b: int) -> Float[np.ndarray, "T D"]:
         return broad_precision(program, _row(pose, b), None if views is None else float(views.px_per_unit[b]))
 
-    return [each if isinstance(each, str) else posterior_of(*each, broad(b)) for b, each in enumerate(blocks)]
+    found: list[Posterior | str] = []
+    for b, each in enumerate(blocks):
+        if isinstance(each, str) or not body:
+            found.append(each if isinstance(each, str) else posterior_of(*each, broad(b)))
+            continue
+        # H·x = b for a given body y: the parameters x of the minimum follow the body by dx/dy = −H⁻¹U, with the block
+        # U of parameters (rows) and body (columns)
+        H, (own, shared) = each
+        free = len(shared) - body
+        inside = Blocks(H.band, H.border[..., :free], H.corner[:free, :free])
+        posterior = posterior_of(inside, Columns(own, shared[:free]), broad(b))
+        if not isinstance(posterior, str):
+            slopes = solve_blocks(posterior.factors, -H.border[..., free:], -H.corner[:free, free:])
+            posterior = posterior._replace(body=BodySensitivity(*slopes, shared[free:]))
+        found.append(posterior)
+    return found
 
 
 def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -> Posterior | str:

@@ -215,15 +215,18 @@ def without_mask_stages(config: FitConfig) -> FitConfig:
 
     A config that has no other stages keeps its stages, without the terms that compare masks. If no term is left, the
     config is returned unchanged.
+
+    A stage that shares the body, and the stages after it, only lose the terms that compare masks.
     """
     only_masks = all(map(needs_mask, config.stages))
     kept: list[StageConfig] = []
     for stage in config.stages:
         others = tuple(name for name, term in find_terms(stage.terms).items() if not term.compares_masks)
         carry = stage.carry_moments and bool(kept) and kept[-1].solver == "adam"
-        if kept and needs_mask(stage) and not only_masks:
+        shares = stage.share_body or any(before.share_body for before in kept)
+        if kept and needs_mask(stage) and not (only_masks or shares):
             kept.append(_continuation(kept[-1], stage))
-        elif others and (only_masks or not needs_mask(stage)):
+        elif others and (only_masks or shares or not needs_mask(stage)):
             kept.append(replace(stage, terms=others, carry_moments=carry))
     return replace(config, stages=tuple(kept)) if kept else config
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from jaxfit.fitting.batch import FittedWindow
+from jaxfit.fitting.bodies import BodyEvidence
 from jaxfit.fitting.error_bars import ErrorBars, pack, unpack
 from jaxfit.fitting.tiles import tile_size
 from jaxfit.fitting.windows import Windows, window_hash
@@ -33,6 +35,7 @@ _LAYOUT = {
     "keypoints_px": "W T K 2",
     "ambiguity_deg": "W T",
     "error_bars": "W T E",  # no number (E = 0) for a config without error bars
+    "body": "W F",  # no number (F = 0) for a stage that shares no body
     **_POSE,
 }
 
@@ -52,15 +55,20 @@ class StoredWindows:
         """The number of windows that were found or added, for progress."""
         return f"{self._count} {'window' if self._count == 1 else 'windows'} fitted"
 
-    def find(self, windows: Windows) -> dict[int, FittedWindow]:
+    def find(self, windows: Windows, contents: Mapping[int, bytes]) -> dict[int, FittedWindow]:
         """Return row → result of the windows that are stored.
+
+        Args:
+            windows: all windows.
+            contents: row → what determines the result beside the window; only these rows count.
 
         Raises:
             InputError: a file is damaged.
         """
         rows: dict[str, list[int]] = {}
         for w in np.argsort(windows.frame.max(1), kind="stable").tolist() if self._parts.numbers else ():
-            rows.setdefault(window_hash(windows, w), []).append(w)
+            if w in contents:
+                rows.setdefault(window_hash(windows, w, contents[w]), []).append(w)
         found = {}
         for number in self._parts.numbers:
             arrays = self._parts.load(number, _LAYOUT)
@@ -74,13 +82,14 @@ class StoredWindows:
                     str(arrays["failure"][i]),
                     arrays["ambiguity_deg"][i],
                     _error_bars(arrays, i),
+                    _evidence(arrays, i),
                 )
                 found |= {w: result for w in rows.get(content, ())}
-        self._count = len(found)
+        self._count += len(found)
         return found
 
-    def add(self, windows: Windows, results: Mapping[int, FittedWindow]) -> None:
-        """Store the results of some windows, by row.
+    def add(self, windows: Windows, results: Mapping[int, FittedWindow], contents: Mapping[int, bytes]) -> None:
+        """Store the results of some windows, by row; `contents` as for `find`.
 
         Raises:
             InputError: the disk is full, or the folder cannot be written.
@@ -90,7 +99,7 @@ class StoredWindows:
         poses = {name: np.stack([getattr(result.pose, name) for result in some]) for name in _POSE}
         self._parts.add(
             {
-                "content": np.array([window_hash(windows, w) for w in results]),
+                "content": np.array([window_hash(windows, w, contents[w]) for w in results]),
                 "failure": np.array([result.failure for result in some]),
                 "loss": np.array([list(result.loss.values()) for result in some], np.float64),
                 "loss_terms": np.array(list(some[0].loss)),
@@ -98,6 +107,7 @@ class StoredWindows:
                 "keypoints_px": np.stack([result.keypoints_px for result in some]),
                 "ambiguity_deg": np.stack([result.ambiguity_deg for result in some]),
                 "error_bars": np.stack([_packed(result) for result in some]),
+                "body": np.stack([_packed_evidence(result) for result in some]),
                 **poses,
             }
         )
@@ -114,6 +124,21 @@ def _error_bars(arrays: Mapping[str, np.ndarray], i: int) -> ErrorBars | None:
         return None
     sizes = arrays["body_pose"].shape[2], arrays["betas"].shape[1], arrays["keypoints_cam"].shape[2]
     return unpack(packed, *sizes)
+
+
+def _packed_evidence(result: FittedWindow) -> np.ndarray:
+    return np.zeros(0) if result.body is None else np.concatenate([each.ravel() for each in result.body])
+
+
+def _evidence(arrays: Mapping[str, np.ndarray], i: int) -> BodyEvidence | None:
+    packed, K = arrays["body"][i], arrays["keypoints_cam"].shape[2]
+    if not len(packed):
+        return None
+    P = math.isqrt(len(packed) - 4 * K)  # P + P² + 4K numbers, and P² ≤ P + P² < (P + 1)²
+    shapes = (P,), (P, P), (K, 2), (K,), (K,)
+    ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
+    parts = np.split(packed, ends)
+    return BodyEvidence(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
 
 
 def windows_per_part(birds: int, frames: int) -> int:

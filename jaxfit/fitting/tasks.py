@@ -6,15 +6,17 @@ The result of a window does not depend on the other windows of its task, so task
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.fitting.batch import Batch, FittedWindow, fit_batch, frames_per_batch
+from jaxfit.fitting.bodies import Body, estimate_bodies, stages_of_pass
 from jaxfit.fitting.initial_poses import search_initial_poses
 from jaxfit.fitting.solve import FitModel, needs_mask
 from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
@@ -27,6 +29,20 @@ from jaxfit.model.kinematics import Pose, rest_pose
 _logger = logging.getLogger(__name__)
 
 
+class Start(NamedTuple):
+    """The start of the stages with a given body, for one window."""
+
+    pose: Pose
+    """The optimum of the stages before, with the bone lengths and the shape of the body."""
+    ambiguity_deg: Float[np.ndarray, "T"]
+    body_covariance: Float[np.ndarray, "P P"]
+
+    @property
+    def content(self) -> bytes:
+        """The content that determines the result, beside the window and the config."""
+        return b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves((self.pose, self.body_covariance)))
+
+
 class FitTask(NamedTuple):
     """Some problems of a fit, with their windows. A problem is one window under one config (a run)."""
 
@@ -36,6 +52,8 @@ class FitTask(NamedTuple):
     """The windows of each run; runs with an equal `windows_key` have the same windows."""
     problems: list[tuple[int, int]]
     """Run and row of the window in the windows of the run."""
+    starts: Mapping[tuple[int, int], Start] | None = None
+    """The start of each problem with a given body; None before the bodies are known."""
 
     def part(self, problems: Sequence[tuple[int, int]]) -> FitTask:
         """Return some problems, with only the windows that they need.
@@ -48,7 +66,11 @@ class FitTask(NamedTuple):
             needed[keys[r]].add(w)
         rows = [sorted(needed[key]) for key in keys]
         windows = [all_windows[np.array(some, int)] for all_windows, some in zip(self.windows, rows, strict=True)]
-        return FitTask(self.configs, windows, [(r, rows[r].index(w)) for r, w in problems])
+        own = [(r, rows[r].index(w)) for r, w in problems]
+        starts = None
+        if self.starts is not None:
+            starts = {new: self.starts[old] for new, old in zip(own, problems, strict=True)}
+        return FitTask(self.configs, windows, own, starts)
 
 
 def _no_report(_steps: float, _note: str) -> None:
@@ -116,8 +138,14 @@ def gather_batch(model: FitModel, task: FitTask) -> Batch:
         return *windows_key(config), config.initialise, config.common_size
 
     targets, targets_row = _prepare_rows(task, windows_key, lambda windows, _: load_targets(windows, mask_px))
+    runs = np.array([r for r, _ in task.problems])
+    if task.starts is not None:
+        starts = [task.starts[problem] for problem in task.problems]
+        pose, ambiguity_deg, covariance = jax.tree.map(lambda *x: np.stack(x), *starts)
+        pose = jax.tree.map(lambda x: x[:, None], pose)  # one hypothesis
+        return Batch(targets, pose, runs, targets_row, np.arange(len(starts)), ambiguity_deg, covariance)
     poses, pose_row = _prepare_rows(task, pose_key, lambda windows, config: initial_poses_of(windows, config, model))
-    return Batch(targets, poses, np.array([r for r, _ in task.problems]), targets_row, pose_row)
+    return Batch(targets, poses, runs, targets_row, pose_row)
 
 
 def _prepare_rows(
@@ -165,6 +193,15 @@ def _in_batches(
     return [ordered[first : first + size] for first in range(0, len(ordered), size)]
 
 
+class Fitted(NamedTuple):
+    """The results of a fit."""
+
+    windows: dict[tuple[int, int], FittedWindow]
+    """The result of every problem."""
+    bodies: list[dict[int, Body]]
+    """For each run: track → its body; empty if no stage of the config shares a body."""
+
+
 def fit_windows(
     task: FitTask,
     model: FitModel,
@@ -173,8 +210,12 @@ def fit_windows(
     progress: ProgressTask,
     stored: StoredWindows | None = None,
     cluster: Cluster | None = None,
-) -> dict[tuple[int, int], FittedWindow]:
+    known: Mapping[int, Body] | None = None,
+) -> Fitted:
     """Fit the problems of a fit in batches, with progress, and store the windows of every batch when they are fitted.
+
+    If a stage shares the body, the windows are fitted up to this stage, the bodies are estimated from all windows of a
+    track, and the windows are fitted with the later stages.
 
     Args:
         task: all problems.
@@ -182,16 +223,58 @@ def fit_windows(
         birds: number of tracks.
         subject: what is fitted, for people.
         progress: shows progress.
-        stored: the store of fitted windows, or None.
+        stored: the store of fitted windows, which are not fitted again, or None. Only for one config.
         cluster: worker processes; None: this process.
+        known: position of a track → its body, which is used and not estimated.
 
     Returns:
-        The result of every problem. A window whose task failed on the workers is not stored.
+        The results. A window whose task failed on the workers is not stored.
     """
-    config, results = task.configs[0], {}
+
+    def run(task: FitTask, subject: str) -> dict[tuple[int, int], FittedWindow]:
+        return _fit_pass(task, model, birds, subject, progress, stored, cluster)
+
+    windows = run(task, subject)
+    shares = any(stage.share_body for stage in task.configs[0].stages)
+    if not shares:
+        return Fitted(windows, [{} for _ in task.configs])
+    bodies, starts = [], {}
+    for r, (config, of_run) in enumerate(zip(task.configs, task.windows, strict=True)):
+        rows = [w for run, w in task.problems if run == r]
+        evidence = [None if windows[r, w].failure else windows[r, w].body for w in rows]
+        bodies.append(estimate_bodies(of_run.track[rows], evidence, model.bird, config) | dict(known or {}))
+        for w in rows:
+            fitted, body = windows[r, w], bodies[r][int(of_run.track[w])]
+            if fitted.failure:  # no later stage: the loss has the terms of the last stage
+                loss = dict.fromkeys(sorted(config.stages[-1].terms), float("nan"))
+                windows[r, w] = fitted._replace(loss=loss, body=None)
+                continue
+            pose = replace(fitted.pose, bone_length=body.bone_length, betas=body.betas)
+            starts[r, w] = Start(pose, fitted.ambiguity_deg, body.covariance)
+    if starts:
+        second = task._replace(problems=[problem for problem in task.problems if problem in starts], starts=starts)
+        windows |= run(second, f"{subject} with their bodies")
+    return Fitted(windows, bodies)
+
+
+def _fit_pass(
+    task: FitTask,
+    model: FitModel,
+    birds: int,
+    subject: str,
+    progress: ProgressTask,
+    stored: StoredWindows | None,
+    cluster: Cluster | None,
+) -> dict[tuple[int, int], FittedWindow]:
+    """Fit the problems of one pass: before the bodies are known, or with given bodies."""
+    config, results, contents = task.configs[0], {}, {}
+    if stored is not None:
+        contents = {w: b"" if task.starts is None else task.starts[r, w].content for r, w in task.problems}
+        results = {(0, w): window for w, window in stored.find(task.windows[0], contents).items()}
+        task = task._replace(problems=[problem for problem in task.problems if problem not in results])
     batches = _in_batches(task, model, birds, stored is not None, cluster is not None)
     _logger.info("%s, %d windows of %d frames, %d batches", subject, len(task.problems), config.window, len(batches))
-    steps = sum(stage.steps for stage in config.stages)
+    steps = sum(config.stages[i].steps for i in stages_of_pass(config, task.starts is not None))
     with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
         parts = (task.part(batch) for batch in batches)
         fitted = _fit_here(parts, model, report_progress)
@@ -204,7 +287,8 @@ def fit_windows(
             if isinstance(windows, FailedTask):
                 windows = failed_windows(model, config, len(batches[i]), f"not computed: {windows.reason}")
             elif stored is not None:
-                stored.add(task.windows[0], {w: window for (_, w), window in zip(batches[i], windows, strict=True)})
+                new = {w: window for (_, w), window in zip(batches[i], windows, strict=True)}
+                stored.add(task.windows[0], new, contents)
                 report_progress(0, "")
             results |= dict(zip(batches[i], windows, strict=True))
     return results

@@ -28,6 +28,7 @@ from jaxfit.data.solution import WORLD, Solution
 from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
 from jaxfit.data.world import in_camera, in_world, whole_picture
 from jaxfit.fitting.batch import FittedWindow
+from jaxfit.fitting.bodies import Body, body_arrays, known_rows
 from jaxfit.fitting.collect import blend_seams, frame_error_bars, gather_windows, pose_shapes
 from jaxfit.fitting.error_bars import error_bar_shapes
 from jaxfit.fitting.fit import check_observations, checked_model, fit
@@ -119,6 +120,7 @@ def fit_views(
     progress: ProgressTask = silent,
     source: object = "observations",
     cluster: Cluster | None = None,
+    bodies: Mapping[int, Body] | None = None,
 ) -> Solution:
     """Fit the poses of birds that several calibrated cameras see.
 
@@ -129,6 +131,7 @@ def fit_views(
         progress: shows progress.
         source: name of the observations in error messages.
         cluster: worker processes that fit the windows.
+        bodies: track id → known body of a bird, as for `fit`.
 
     Returns:
         Poses in the frame of the first camera without distortion, whose crop is the whole picture, in the world
@@ -140,9 +143,8 @@ def fit_views(
     unit_m = metres(bird)
     checked = [check_observations(own, bird, source) for own in views.observations]
     if len(checked) == 1:
-        return _with_world(
-            fit(checked[0], bird, config, None, progress, source, cluster=cluster), bird, views.cameras[0]
-        )
+        solution = fit(checked[0], bird, config, None, progress, source, cluster=cluster, bodies=bodies)
+        return _with_world(solution, bird, views.cameras[0])
     config = views_config(config, any(own.masks for own in checked))
     prepared = [prepare_observations(own, config) for own in checked]
     keypoints = stacked_keypoints(prepared)
@@ -158,12 +160,16 @@ def fit_views(
     model = checked_model(prepared[0], bird, [config], initial, source)
     task = FitTask([config], [windows], [(0, w) for w in range(len(windows))])
     subject = f"{prepared[0].num_tracks} birds × {len(views.cameras)} views"
-    results = fit_windows(task, model, prepared[0].num_tracks, subject, progress, cluster=cluster)
+    known = known_rows(bodies, prepared[0].track_id)
+    birds = prepared[0].num_tracks
+    results, (estimated,) = fit_windows(task, model, birds, subject, progress, cluster=cluster, known=known)
     fitted = [results[problem] for problem in task.problems]
     if config.overlap_frames:
         fitted = blend_seams(windows, fitted, model)
     skipped = without_orientation(prepared[0], points, has_pose)
     solution = _solution(views, prepared[0], windows, fitted, bird, origin_m, unit_m, skipped)
+    if estimated:
+        solution = solution.with_arrays(**body_arrays(estimated, birds, bird, config))
     seen = ((in_camera(solution, bird, camera), own) for camera, own in zip(views.cameras, checked, strict=True))
     return with_doubts_of_views(solution, seen, bird, progress)
 

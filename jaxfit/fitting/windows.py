@@ -262,9 +262,9 @@ def window_content(windows: Windows, w: int) -> tuple:
     return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), lengths
 
 
-def window_hash(windows: Windows, w: int) -> str:
-    """Return the SHA-256 hash of the content of a window."""
-    return hashlib.sha256(repr(window_content(windows, w)).encode()).hexdigest()
+def window_hash(windows: Windows, w: int, more: bytes = b"") -> str:
+    """Return the SHA-256 hash of the content of a window, and of further content."""
+    return hashlib.sha256(repr(window_content(windows, w)).encode() + more).hexdigest()
 
 
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:

@@ -16,8 +16,9 @@ from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.result_folder import CONFIG, OBSERVATIONS, POSES, read_summary
-from jaxfit.data.solution import Solution, load_solution, write_solution
+from jaxfit.data.solution import BODIES, Solution, load_solution, write_solution
 from jaxfit.data.tracks import track_quality
+from jaxfit.fitting.bodies import bodies_of
 from jaxfit.fitting.collect import summarise, track_status
 from jaxfit.fitting.fit import check_observations, fit_runs, windows_of
 from jaxfit.fitting.windows import Windows, window_hash
@@ -51,7 +52,8 @@ def refit(
     """Fit the corrected observations, but only windows that no window of the earlier fit equals.
 
     Two windows are equal if they have the same frames, crops, filtered keypoints, confidences and masks. The fit of a
-    window does not depend on other windows, so the result is that of a fit of all corrected observations. The poses of
+    window does not depend on other windows, so the result is that of a fit of all corrected observations, with the
+    bodies of the earlier result for the tracks that it has. The poses of
     an equal window are copied bit by bit, also if its track has another number now. Where windows share frames
     (`overlap`), a window is copied only if its neighbours are equal too.
 
@@ -80,7 +82,8 @@ def refit(
     touched = np.flatnonzero(source_row < 0)
     result = _empty(solution, after)
     if len(touched):
-        result = fit_runs(after, bird, [config], None, progress, source, select=touched)[0]
+        bodies = bodies_of(solution, config)
+        result = fit_runs(after, bird, [config], None, progress, source, select=touched, bodies=bodies)[0]
     with_bars = result.error_bars is not None or solution.error_bars is not None
     copied = solution.cells(with_bars)
     arrays = {name: values.copy() for name, values in result.cells(with_bars).items()}
@@ -115,6 +118,7 @@ def refit(
                     loss[term][n] = solution.loss[term][_row_of(solution, track)]
     merged = result.with_arrays(
         **arrays,
+        **_merged_bodies(result, solution),
         loss=loss,
         status=np.array([track_status(*count) for count in counts.tolist()], "<U32"),
         failures={track: tuple(texts) for track, texts in failures.items()},
@@ -123,6 +127,20 @@ def refit(
     merged = with_doubts(merged, after, bird, progress)
     fitted = [(int(new.track_id[w]), *_ends(after, new, w)) for w in touched.tolist()]
     return Refit(merged, fitted, len(new))
+
+
+def _merged_bodies(result: Solution, earlier: Solution) -> dict[str, np.ndarray]:
+    """Return the arrays of the bodies: those of the earlier result, and of the new result for its new tracks."""
+    if earlier.bodies is None:
+        return {}
+    now, before, merged = result.arrays(), earlier.arrays(), {}
+    for name in BODIES:
+        empty = np.full((len(result.track_id), *before[name].shape[1:]), np.nan, np.float32)
+        merged[name] = now.get(name, empty).copy()
+        for n, track in enumerate(result.track_id.tolist()):
+            if track in earlier.track_id:
+                merged[name][n] = before[name][_row_of(earlier, track)]
+    return merged
 
 
 def _with_equal_neighbours(source_row: np.ndarray, old: Windows, new: Windows) -> np.ndarray:

@@ -27,7 +27,7 @@ from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.observations import CELLS, MAPPINGS, Observations
 from jaxfit.data.result_folder import OBSERVATIONS, POSES, read_summary
-from jaxfit.data.solution import Solution, write_solution
+from jaxfit.data.solution import BODIES, Solution, write_solution
 from jaxfit.data.tracks import frame_step, track_quality
 from jaxfit.fitting.collect import summarise
 from jaxfit.foundation.errors import InputError
@@ -69,7 +69,8 @@ def concatenate_solutions(
     """Return the poses of all frames; arguments as of `concatenate_observations`.
 
     The status of a track is `ok` if the track has this status in all parts, and the losses of its parts are summed.
-    Error bars are NaN in parts without error bars.
+    Error bars are NaN in parts without error bars. The body of a track is that of the part whose data say most about
+    it.
     """
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _TIMES}
     if any(part.error_bars is not None for part in parts):
@@ -90,7 +91,22 @@ def concatenate_solutions(
                 if np.isfinite(values[n]):
                     loss[term][joined] = np.nansum([loss[term][joined], values[n]])
     status = np.array([_status(of_parts) for of_parts in statuses], "<U32")
+    arrays |= _bodies(parts, rows, len(track_id))
     return parts[0].with_arrays(track_id=track_id, **arrays, loss=loss, status=status, failures=failures)
+
+
+def _bodies(parts: Sequence[Solution], rows: Sequence[Int[np.ndarray, "n"]], count: int) -> dict[str, np.ndarray]:
+    """Return the arrays of the bodies; none if no part has bodies."""
+    known = [(part.arrays(), row) for part, row in zip(parts, rows, strict=True) if part.bodies is not None]
+    if not known:
+        return {}
+    merged = {name: np.full((count, *known[0][0][name].shape[1:]), np.nan, np.float32) for name in BODIES}
+    for arrays, row in known:
+        before, frames = merged["body_frames"][row], arrays["body_frames"]
+        better = ~np.isnan(frames) & ~(before >= frames)
+        for name, values in merged.items():
+            values[row[better]] = arrays[name][better]
+    return merged
 
 
 def _in_rows(parts: Sequence[np.ndarray], rows: Sequence[np.ndarray], count: int, absent: float) -> np.ndarray:

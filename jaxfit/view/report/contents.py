@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.data.body_lengths import BodyLength, body_lengths
 from jaxfit.data.flags import CONTRADICTED, FLAGS, UNSURE, expected_error, flagged_ranges, flags
 from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.result_folder import SUMMARY
-from jaxfit.data.solution import Solution
+from jaxfit.data.solution import Bodies, Solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
 from jaxfit.foundation.errors import InputError, counted
 from jaxfit.model.bird import Bird
@@ -52,6 +53,8 @@ class Track:
     expected_error: Float[np.ndarray, "T"]
     """RMS error of the keypoints that the error bars expect, as a share of the length of the bird
     (`jaxfit.data.flags.expected_error`); NaN without a pose or without error bars."""
+    body: str | None = None
+    """Lengths of the bird, in per cent of the model; None for a result without bodies."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,8 @@ def gather(
         summary: content of `summary.json`.
         config: the config as YAML.
         folder: folder of the result.
-        bird: the model of the result; None leaves out error bars, which are shares of the length of the bird.
+        bird: the model of the result; None leaves out error bars and bodies, which are shares of the lengths of the
+            model.
 
     Raises:
         InputError: an entry of the summary has another type than jaxfit writes.
@@ -167,7 +171,7 @@ def gather(
         problem = f"has an entry that jaxfit does not write: {error}"
         raise InputError(folder / SUMMARY, problem, "run the reconstruction again") from error
     video = entries["video"]
-    tracks = _tracks(solution, observations, problems, expected)
+    tracks = _tracks(solution, observations, problems, expected, bird)
     return Report(
         folder=str(folder),
         title=Path(video).name or video if video else folder.name,
@@ -216,6 +220,7 @@ def _tracks(
     observations: Observations | None,
     problems: Mapping[str, tuple[str, ...]],
     expected: Float[np.ndarray, "N T"],
+    bird: Bird | None,
 ) -> list[Track]:
     means = mean_confidence(observations.confidence) if observations and observations.num_keypoints else None
     quality = {} if observations is None else {row.track_id: row for row in track_quality(observations)}
@@ -223,6 +228,8 @@ def _tracks(
     size = _image_size(solution)
     total = np.sum(list(solution.loss.values()), axis=0) if solution.loss else np.full(len(solution.track_id), np.nan)
     found, flagged = flags(np.asarray(solution.flags.doubts)), flagged_ranges(solution)
+    bodies = solution.bodies
+    lengths = {} if bodies is None or bird is None else body_lengths(bird, bodies)
     tracks = []
     for n, track_id in enumerate(solution.track_id.tolist()):
         valid, present, confidence = solution.valid[n], solution.valid[n], None
@@ -248,9 +255,20 @@ def _tracks(
                 flags=found[n],
                 flagged=flagged.get(track_id, ()),
                 expected_error=expected[n],
+                body=_body(bodies, lengths, n) if bodies is not None and lengths else None,
             )
         )
     return tracks
+
+
+def _body(bodies: Bodies, lengths: Mapping[str, BodyLength], n: int) -> str:
+    """Return the lengths of a bird as text, in per cent of the model."""
+    if not np.isfinite(bodies.frames[n]):
+        return "–"
+    if bodies.determined[n] < 1:
+        return "as the model"
+    rows = (f"{name} {100 * each.share[n]:.0f} ± {100 * each.sd[n]:.0f}" for name, each in lengths.items())
+    return ", ".join(rows)
 
 
 def _image_size(solution: Solution) -> Float[np.ndarray, "N T"]:

@@ -106,6 +106,8 @@ _MEANINGS = {
     "cent of the length of the bird, without the error of the position of the whole bird. The number is the median. "
     "The curve goes from 0 % to 10 %, above which a pose is unsure. Marks at the upper edge show the flags unsure and "
     "contradicted. With detections of networks, error bars are too narrow.",
+    "Body": "Lengths of the bird in the rest pose, estimated from its whole track, in per cent of those of the model, "
+    "with their standard deviations. `as the model`: the track determines no length.",
     "Objective": "Final value of the objective of the fit for each pose. Compare birds of one result only.",
     "Trust": "A comparison of this footage with the footage that the networks were trained on. High trust is no "
     "proof: look at the overlay.",
@@ -157,6 +159,8 @@ def page(
         meanings = [pair for pair in meanings if pair[0] != "Size in the image"]
     if not report.has_error_bars:
         meanings = [pair for pair in meanings if pair[0] != "Error bars"]
+    if all(track.body is None for track in report.tracks):
+        meanings = [pair for pair in meanings if pair[0] != "Body"]
     section = None
     if behaviour is not None and report.over_time and report.poses:
         if len(behaviour.track_id) != len(report.tracks) or not np.array_equal(behaviour.frames, report.frames):
@@ -216,6 +220,8 @@ def _table(report: Report) -> tuple[list[tuple[str, str]], list[tuple[Track, lis
     names.append(("Objective", "per pose"))
     names += [("Error bars", "% of length, 0 to 10 %" if over_time else "% of length")] if report.has_error_bars else []
     names += [("Size in the image", "±30 %")] if over_time else []
+    has_bodies = any(track.body is not None for track in report.tracks)
+    names += [("Body", "% of the model")] if has_bodies else []
     rows = []
     for track in report.tracks:
         quality, cells = track.quality, []
@@ -238,5 +244,7 @@ def _table(report: Report) -> tuple[list[tuple[str, str]], list[tuple[Track, lis
         if over_time:
             curve = size_curve(track)
             cells.append(Cell("–" if curve is None else "", curve))
+        if has_bodies:
+            cells.append(Cell(track.body or "–"))
         rows.append((track, cells))
     return names, rows

@@ -1,0 +1,249 @@
+"""Bodies: bone lengths and shape of each bird from all windows of its track.
+
+A stage with `share_body` optimises bone lengths and shape in every window, with the priors of the model. For a window,
+let A be the marginal precision of these numbers b (the poses integrated out, `fitting/posterior.py`), P the precision
+of the prior with the mean μ, and m the optimum. The data of the window then say
+
+    I = A − P,   s = A·(m − μ),
+
+information and score about b − μ. The windows of a track are added, and the body is the mean of
+
+    b − μ ~ N(Σ·s, Σ),   Σ = (P + κ·ΣI)⁻¹,   s = κ·Σs.
+
+The errors of a detector agree between frames: a keypoint that lies 1 % too low in one frame lies too low in the next
+frame. A body that all frames share takes up such errors, and free bones then make the poses worse. So n frames count as
+n_eff = κ·n frames only, with
+
+    1/n_eff = Σ_k n·r̄_k² / Σ_k n·(mean of r_k²),
+
+the share of the mean over the track in the squared errors r of the keypoints, summed over keypoints. For independent
+errors, n_eff is the number of frames; for errors that do not change, n_eff is 1. Errors longer than
+`LONGEST` times the median length of a window are shortened to this length.
+
+Left and right bones differ by about 1 % (`ASYMMETRY_SD`), whatever the prior of the model says about them.
+
+A second fit with fixed bodies follows, so that no window has a body of its own: the poses of a window would otherwise
+fit a body that the other windows contradict.
+
+Source: Kish 1965, *Survey Sampling* (n_eff, the design effect of clusters); Palmer and Strobeck 1986, *Fluctuating
+asymmetry: measurement, analysis, patterns* (differences between left and right of about 1 %). The rest is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.linalg import block_diag
+
+from jaxfit.config.fit import FitConfig, StageConfig
+from jaxfit.data.solution import Solution
+from jaxfit.fitting.posterior import window_posteriors
+from jaxfit.fitting.problem import Problem, Program
+from jaxfit.fitting.solve import report, shared_parameters
+from jaxfit.model.bird import Bird
+from jaxfit.model.kinematics import Pose
+from jaxfit.objective.posed_window import priors_of
+
+ASYMMETRY_SD = 0.01
+"""Standard deviation of the difference between a left and a right bone, relative to their length."""
+LONGEST = 3.0
+"""Largest length of an error, in units of the median of its window: outliers do not decide n_eff."""
+
+
+class BodyEvidence(NamedTuple):
+    """What a window says about the body of its bird, P numbers; NumPy arrays. A batch adds a leading axis B."""
+
+    mean: Float[np.ndarray, "*B P"]
+    """m: the optimised bone lengths and shape coefficients."""
+    precision: Float[np.ndarray, "*B P P"]
+    """A; NaN for a window without a posterior."""
+    error_sum: Float[np.ndarray, "*B K 2"]
+    """Sum over the frames of the errors of each keypoint, crop pixels, shortened."""
+    error_squares: Float[np.ndarray, "*B K"]
+    """Sum of their squared lengths."""
+    errors: Float[np.ndarray, "*B K"]
+    """Their number."""
+
+
+class Body(NamedTuple):
+    """The bone lengths and the shape of one bird."""
+
+    bone_length: Float[np.ndarray, "bones"]
+    """Relative to the rest skeleton."""
+    betas: Float[np.ndarray, "S"]
+    covariance: Float[np.ndarray, "P P"]
+    """Σ of the numbers that the stage optimises: bone lengths, then shape coefficients."""
+    frames: float
+    """n_eff: the number of independent frames that the data of the track are worth."""
+    determined: float
+    """Number of determined numbers, P − tr(Σ·P₀) with the precision P₀ of the prior: 0 if the body is the prior's."""
+
+
+def stages_of_pass(config: FitConfig, has_bodies: bool) -> range:
+    """Return the positions of the stages before the bodies are known, or with given bodies."""
+    shared = [i + 1 for i, stage in enumerate(config.stages) if stage.share_body]
+    if not shared:
+        return range(len(config.stages))
+    return range(shared[0], len(config.stages)) if has_bodies else range(shared[0])
+
+
+def body_evidence(program: Program, problems: Problem, pose: Pose) -> list[BodyEvidence]:
+    """Return what each of B windows says about its body.
+
+    Args:
+        program: the program of the stage that shares the body.
+        problems: B problems.
+        pose: their optima.
+    """
+    fitted_px = np.asarray(report(program, problems, pose).keypoints_px, np.float64)
+    found = []
+    for b, posterior in enumerate(window_posteriors(program, problems, pose)):
+        values = [np.asarray(getattr(pose, name)[b], np.float64) for name in program.shared]
+        mean = np.concatenate(values)
+        precision = np.full((len(mean), len(mean)), np.nan)
+        if not isinstance(posterior, str):
+            # the inverse of the block of H⁻¹ integrates the poses and the size out; the body is its last columns
+            precision = np.linalg.inv(posterior.factors.corner[-len(mean) :, -len(mean) :])
+        targets = problems.targets
+        seen = np.asarray(targets.confidence[b] > 0) & np.asarray(targets.present[b])[:, None]
+        error = np.where(seen[..., None], fitted_px[b] - np.asarray(targets.keypoints_px[b]), 0)
+        length = np.linalg.norm(error, axis=-1)
+        longest = LONGEST * np.median(length[seen]) if seen.any() else 0.0
+        error = error * np.minimum(1, longest / np.maximum(length, 1e-9))[..., None]
+        found.append(BodyEvidence(mean, precision, error.sum(0), (error**2).sum((0, 2)), seen.sum(0).astype(float)))
+    return found
+
+
+def estimate_bodies(
+    track: Int[np.ndarray, "W"],
+    evidence: Sequence[BodyEvidence | None],
+    bird: Bird,
+    config: FitConfig,
+) -> dict[int, Body]:
+    """Return the body of each track.
+
+    Args:
+        track: the track of each window.
+        evidence: of each window; None for a window that failed.
+        bird: the model.
+        config: the config, whose shared stage has the weights of the priors.
+    """
+    stage = config.stages[stages_of_pass(config, has_bodies=False)[-1]]
+    mean, precision = _prior(bird, config, stage)
+    prior = _symmetric(precision, bird, stage)
+    usable = [w for w, each in enumerate(evidence) if each is not None and np.isfinite(each.precision).all()]
+    bodies = {}
+    for n in np.unique(track).tolist():
+        own = [cast(BodyEvidence, evidence[w]) for w in usable if track[w] == n]
+        information, score, frames = np.zeros_like(precision), np.zeros_like(mean), 0.0
+        for each in own:
+            information += each.precision - precision
+            score += each.precision @ (each.mean - mean)
+            frames += each.errors.max(initial=0)
+        # rounding and ridges may leave slightly negative directions, which say nothing
+        values, vectors = np.linalg.eigh((information + information.T) / 2)
+        information = (vectors * np.maximum(values, 0)) @ vectors.T
+        counted = min(1 / max(_common_share(own), 1e-9), frames) if own else 0.0
+        kappa = counted / max(frames, 1.0)
+        covariance = np.linalg.inv(prior + kappa * information)
+        numbers = _split(mean + covariance @ (kappa * score), bird, stage)
+        determined = len(mean) - float(np.trace(covariance @ prior))
+        bodies[n] = Body(*numbers, (covariance + covariance.T) / 2, counted, determined)
+    return bodies
+
+
+def _prior(bird: Bird, config: FitConfig, stage: StageConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and precision of the prior of the numbers that the stage optimises, as the fit counts it."""
+    settings, priors = config.stage_settings(stage), priors_of(bird)
+    whitener, shape_sd = (np.asarray(each, np.float64) for each in (priors.bone_whitener, priors.shape_sd))
+    # a term w·‖W(b − μ)‖² in nats has the precision 2w·WᵀW; the broad prior of the posterior comes on top
+    of = {
+        "bone_length": (priors.bone_mean, "bone_prior", whitener.T @ whitener, 1.0),
+        "betas": (np.zeros(len(shape_sd)), "shape_prior", np.diag(shape_sd**-2), 0.01),
+    }
+    means, blocks = [], []
+    for name in shared_parameters(stage):
+        mean, term, precision, broad = of[name]
+        means.append(np.asarray(mean, np.float64))
+        weight = settings.get(term, {}).get("weight", 0.0)
+        blocks.append(2 * weight * precision + broad * np.eye(len(precision)))
+    return np.concatenate(means), np.asarray(block_diag(*blocks))
+
+
+def _symmetric(precision: Float[np.ndarray, "P P"], bird: Bird, stage: StageConfig) -> Float[np.ndarray, "P P"]:
+    """Return the precision of the prior with the small differences between left and right bones."""
+    if "bone_length" not in stage.optimised:
+        return precision
+    result = precision.copy()
+    for left, right in bird.joint_pairs:
+        if left and right:
+            difference = np.zeros(len(precision))
+            difference[[left - 1, right - 1]] = 1, -1
+            result += np.outer(difference, difference) / ASYMMETRY_SD**2
+    return result
+
+
+def _split(body: Float[np.ndarray, "P"], bird: Bird, stage: StageConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return bone lengths and shape coefficients; those that the stage does not optimise are the mean of the model."""
+    bones: np.ndarray = np.array(bird.bone_mean, np.float32)
+    shapes = np.zeros(bird.num_shapes, np.float32)
+    names = shared_parameters(stage)
+    if "bone_length" in names:
+        bones = body[: len(bones)].astype(np.float32)
+    if "betas" in names:
+        shapes = body[-len(shapes) or len(body) :].astype(np.float32)
+    return bones, shapes
+
+
+def _common_share(evidence: Sequence[BodyEvidence]) -> float:
+    """Return 1/n_eff: the share of the squared errors of the keypoints that all frames of a track have in common."""
+    errors = sum(each.errors for each in evidence)
+    mean = sum(each.error_sum for each in evidence) / np.maximum(errors, 1)[:, None]
+    total = sum(float(each.error_squares.sum()) for each in evidence)
+    return float((errors * (mean**2).sum(-1)).sum()) / total if total > 0 else 1.0
+
+
+def body_arrays(bodies: Mapping[int, Body], birds: int, bird: Bird, config: FitConfig) -> dict[str, np.ndarray]:
+    """Return the arrays of `data.solution.Bodies` by their names in ``poses.npz``, for `birds` tracks."""
+    bones, shapes = bird.num_joints - 1, bird.num_shapes
+    sizes = {"bone_length": bones, "bone_length_sd": bones, "betas": shapes, "betas_sd": shapes}
+    arrays = {name: np.full((birds, size), np.nan, np.float32) for name, size in sizes.items()}
+    arrays |= {name: np.full(birds, np.nan, np.float32) for name in ("frames", "determined")}
+    names = shared_parameters(config.stages[stages_of_pass(config, has_bodies=False)[-1]])
+    for n, body in bodies.items():
+        arrays["bone_length"][n], arrays["betas"][n, : len(body.betas)] = body.bone_length, body.betas
+        arrays["betas"][n, len(body.betas) :] = 0  # for a fit without shape coefficients
+        arrays["frames"][n], arrays["determined"][n] = body.frames, body.determined
+        sd = np.sqrt(np.diagonal(body.covariance))
+        for name, size in (("bone_length", bones), ("betas", len(body.betas))):
+            arrays[f"{name}_sd"][n] = 0
+            if name in names:
+                arrays[f"{name}_sd"][n, :size], sd = sd[:size], sd[size:]
+    return {f"body_{name}": array for name, array in arrays.items()}
+
+
+def bodies_of(solution: Solution, config: FitConfig) -> dict[int, Body]:
+    """Return track id → body of a result; empty for a result without bodies.
+
+    The covariances of a result are diagonal: it holds standard deviations.
+    """
+    known, stages = solution.bodies, [stage for stage in config.stages if stage.share_body]
+    if known is None or not stages:
+        return {}
+    names, found = shared_parameters(stages[0]), {}
+    for n in np.flatnonzero(np.isfinite(known.frames)).tolist():
+        sd = np.concatenate([getattr(known, f"{name}_sd")[n] for name in names]).astype(np.float64)
+        numbers = known.bone_length[n], known.betas[n]
+        found[int(solution.track_id[n])] = Body(
+            *numbers, np.diag(sd**2), float(known.frames[n]), float(known.determined[n])
+        )
+    return found
+
+
+def known_rows(bodies: Mapping[int, Body] | None, track_id: Int[np.ndarray, "N"]) -> dict[int, Body]:
+    """Return position of a track → its known body, from track id → body; other ids do not matter."""
+    ids = track_id.tolist()
+    return {ids.index(track): body for track, body in (bodies or {}).items() if track in ids}

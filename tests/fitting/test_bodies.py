@@ -1,0 +1,197 @@
+"""One body for each track: the estimate against dense algebra, its use in a fit, and its way through files."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from support.birds import tiny_bird
+from support.fits import CAMERA, T, config
+
+from jaxfit.config.build import with_values
+from jaxfit.config.fit import StageConfig
+from jaxfit.data.solution import load_solution, save_solution
+from jaxfit.fitting.bodies import ASYMMETRY_SD, BodyEvidence, bodies_of, estimate_bodies
+from jaxfit.fitting.error_bars import _with_body
+from jaxfit.fitting.fit import fit
+from jaxfit.fitting.posterior import BodySensitivity
+from jaxfit.foundation.errors import InputError
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
+
+BIRD = tiny_bird(shapes=0)
+BONES = BIRD.num_joints - 1
+POSE = ("global_orient", "body_pose", "transl", "scale")
+TERMS = ("keypoint_likelihood", "pose_prior", "motion_likelihood", "place_likelihood")
+
+
+def stages(body_steps=6, last_steps=4):
+    common = {"solver": "levenberg_marquardt", "step_scale": {"transl": (1.0, 1.0, 0.0)}}
+    return (
+        StageConfig("keypoints", 10, TERMS, POSE, **common),
+        StageConfig("body", body_steps, (*TERMS, "bone_prior"), (*POSE, "bone_length"), share_body=True, **common),
+        StageConfig("poses", last_steps, TERMS, POSE, **common),
+    )
+
+
+TERM_SETTINGS = {
+    "keypoint_likelihood": {"sd_sure_px": 0.5, "dof": 30},
+    "pose_prior": 0.5,
+    "bone_prior": 0.5,
+    "motion_likelihood": {"sd_rad_s2": 60.0},
+    "place_likelihood": {"sd_px_s2": 3000.0},
+}
+CONFIG = dataclasses.replace(config(memory_gb=1.0), terms=TERM_SETTINGS, stages=stages())
+
+
+LENGTHS = np.float32([[1.25, 0.85, 0.85], [0.8, 1.2, 1.2]])
+"""Bone lengths of two birds: head, left wing, right wing."""
+
+
+def individuals(frames):
+    """Return smooth motion of birds whose bones differ from the model's."""
+    poses = (jax.tree.map(np.asarray, smooth_motion(BIRD, frames, n)) for n in range(len(LENGTHS)))
+    return [dataclasses.replace(pose, bone_length=bones) for pose, bones in zip(poses, LENGTHS, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    poses = individuals(2 * T)
+    observed = detect(BIRD, poses, 0.1, 0.0, 0, camera=CAMERA)
+    return observed, fit(observed, BIRD, dataclasses.replace(CONFIG, error_bars=True))
+
+
+def evidence(window_means, precision, errors):
+    """Return the evidence of a window: errors (T, K, 2) of keypoints."""
+    sums, squares = errors.sum(0), (errors**2).sum((0, 2))
+    return BodyEvidence(window_means, precision, sums, squares, np.full(errors.shape[1], float(len(errors))))
+
+
+def prior_precision():
+    prior = np.linalg.inv(np.asarray(BIRD.bone_covariance, np.float64)) + np.eye(BONES)
+    symmetric = prior.copy()
+    for left, right in BIRD.joint_pairs:
+        rows = [left - 1, right - 1]
+        symmetric[np.ix_(rows, rows)] += np.array([[1, -1], [-1, 1]]) / ASYMMETRY_SD**2
+    return prior, symmetric
+
+
+def test_body_is_the_posterior_of_all_windows():
+    """The oracle stacks the data of all windows and the prior in one least-squares problem."""
+    rng, mean = np.random.default_rng(0), np.asarray(BIRD.bone_mean, np.float64)
+    prior, symmetric = prior_precision()
+    white = rng.standard_normal((50, 8, 2))
+    white -= white.mean(0)  # no common part: all frames count
+    rows, right, windows = [np.linalg.cholesky(symmetric).T], [np.linalg.cholesky(symmetric).T @ mean], []
+    for _ in range(3):
+        J, y = rng.standard_normal((20, BONES)), rng.standard_normal(20)
+        A = J.T @ J + prior
+        windows.append(evidence(np.linalg.solve(A, J.T @ y + prior @ mean), A, white))
+        rows.append(J)
+        right.append(y)
+    expected = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+    (body,) = estimate_bodies(np.zeros(3, int), windows, BIRD, CONFIG).values()
+    np.testing.assert_allclose(body.bone_length, expected, rtol=1e-5)
+    stacked = np.concatenate(rows)
+    np.testing.assert_allclose(
+        body.covariance, np.linalg.inv(stacked.T @ stacked), rtol=1e-6
+    )  # the prior is in float32
+    assert body.frames == 150
+
+
+def test_errors_that_all_frames_share_count_once():
+    mean = np.asarray(BIRD.bone_mean, np.float64)
+    prior, _ = prior_precision()
+    A = 50 * prior
+    errors = np.random.default_rng(1).standard_normal((400, 40, 2))
+    frames = {}
+    for name, values in {
+        "independent": errors,
+        "half": errors + np.random.default_rng(2).standard_normal((1, 40, 2)),
+        "constant": np.ones((400, 40, 2)),
+    }.items():
+        (body,) = estimate_bodies(np.zeros(1, int), [evidence(mean + 0.1, A, values)], BIRD, CONFIG).values()
+        frames[name] = body.frames
+        assert (np.abs(body.bone_length - mean) <= 0.1 + 1e-6).all()
+    assert frames["independent"] > 300
+    assert frames["half"] == pytest.approx(2, rel=0.3)  # half of the squares are common
+    assert frames["constant"] == pytest.approx(1)
+
+
+def test_without_a_usable_window_the_body_is_that_of_the_model():
+    nothing = BodyEvidence(np.ones(BONES), np.full((BONES, BONES), np.nan), np.zeros((8, 2)), np.zeros(8), np.zeros(8))
+    bodies = estimate_bodies(np.array([0, 1]), [nothing, None], BIRD, CONFIG)
+    for body in bodies.values():
+        np.testing.assert_array_equal(body.bone_length, np.asarray(BIRD.bone_mean))
+        assert body.frames == 0
+        assert body.determined == pytest.approx(0, abs=1e-9)
+
+
+def test_fit_finds_the_bones_of_each_bird(fitted):
+    _, solution = fitted
+    error = np.abs(solution.bodies.bone_length - LENGTHS)
+    assert (error.mean(1) < 0.5 * np.abs(1 - LENGTHS).mean(1)).all()
+    assert (error < 4 * solution.bodies.bone_length_sd).all()
+    # one body in all windows of a track
+    assert (solution.poses.bone_length == solution.bodies.bone_length[:, None]).all()
+    # the error bars of the poses contain those of the body
+    np.testing.assert_allclose(
+        np.nanmean(solution.error_bars.bone_length_sd, axis=1), solution.bodies.bone_length_sd, rtol=1e-3
+    )
+
+
+def test_bodies_do_not_depend_on_other_birds(fitted):
+    observed, together = fitted
+    alone = fit(observed.select(tracks=[1]), BIRD, dataclasses.replace(CONFIG, error_bars=True))
+    np.testing.assert_array_equal(alone.bodies.bone_length[0], together.bodies.bone_length[1])
+    np.testing.assert_array_equal(alone.poses.body_pose[0], together.poses.body_pose[1])
+
+
+def test_known_body_is_kept(fitted, tmp_path):
+    observed, solution = fitted
+    save_solution(solution, BIRD, "", {}, tmp_path / "result")
+    loaded, _ = load_solution(tmp_path / "result")
+    known = bodies_of(loaded, CONFIG)
+    assert list(known) == observed.track_id.tolist()
+    changed = {1: known[1]._replace(bone_length=np.full(BONES, 1.25, np.float32))}
+    again = fit(observed, BIRD, dataclasses.replace(CONFIG, error_bars=True), bodies=changed)
+    np.testing.assert_array_equal(again.bodies.bone_length[1], 1.25)
+    np.testing.assert_array_equal(again.bodies.bone_length[0], solution.bodies.bone_length[0])
+    assert (again.poses.bone_length[1] == 1.25).all()
+
+
+def test_error_bars_with_a_body_are_those_of_the_joint_precision():
+    rng = np.random.default_rng(3)
+    L, P = 5, 3
+    H, U = (lambda a: a @ a.T + np.eye(L))(rng.standard_normal((L, L))), rng.standard_normal((L, P))
+    of_body = (lambda a: a @ a.T + np.eye(P))(rng.standard_normal((P, P)))
+    # the oracle: the precision of pose and body, whose body has the marginal covariance `of_body`
+    corner = np.linalg.inv(of_body) + U.T @ np.linalg.solve(H, U)
+    expected = np.linalg.inv(np.block([[H, U], [U.T, corner]]))
+    slopes = BodySensitivity(-np.linalg.solve(H, U)[None], np.zeros((0, P)), np.arange(P))
+    (found,) = _with_body(np.linalg.inv(H)[None], slopes, of_body)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"stages": stages()[:2]}, "stages[1].share_body"),
+        ({"stages": (*stages()[:2], stages()[1])}, "stages[1].share_body"),
+        ({"stages": (dataclasses.replace(stages()[0], share_body=True), *stages()[2:])}, "stages[0].share_body"),
+    ],
+)
+def test_wrong_use_of_a_shared_body_names_the_stage(changes, key):
+    with pytest.raises((ValueError, InputError), match=key.replace("[", r"\[").replace("]", r"\]")):
+        dataclasses.replace(CONFIG, **changes)
+
+
+def test_without_masks_the_body_keeps_its_stages():
+    from jaxfit.config.fit import load_config
+    from jaxfit.fitting.solve import without_mask_stages
+
+    left = without_mask_stages(with_values(load_config("map"), {}))
+    (shared,) = (stage for stage in left.stages if stage.share_body)
+    assert "bone_length" in shared.optimised
+    assert not any("mask" in term for stage in left.stages for term in stage.terms)
+    assert "bone_length" not in left.stages[-1].optimised
