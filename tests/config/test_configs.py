@@ -48,7 +48,7 @@ def test_balanced_and_map():
     assert balanced.stage_settings(stage) == settings | changed
     # with the scale of the last stage in the first stage, wingbeats would be rounded off from the start
     scales = [config.stage_settings(stage)["motion_likelihood"]["sd_rad_s2"] for stage in config.stages]
-    assert scales == [62.5, 6.25]
+    assert scales == [62.5, 6.25, 6.25, 6.25]
 
 
 @pytest.mark.parametrize("name", shipped_fit_configs())
