@@ -52,9 +52,9 @@ def counting():
     """Return the hashes of the windows that are fitted and stored."""
     fitted, add = [], StoredWindows.add
 
-    def added(self, windows, results):
-        fitted.extend(window_hash(windows, w) for w in results)
-        add(self, windows, results)
+    def added(self, windows, results, contents):
+        fitted.extend(window_hash(windows, w, contents[w]) for w in results)
+        add(self, windows, results, contents)
 
     with mock.patch.object(StoredWindows, "add", added):
         yield fitted
