@@ -15,7 +15,9 @@ from jaxfit.fitting.bodies import ASYMMETRY_SD, BodyEvidence, bodies_of, estimat
 from jaxfit.fitting.error_bars import _with_body
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.posterior import BodySensitivity
+from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.unfinished import Parts
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
 
@@ -145,6 +147,28 @@ def test_bodies_do_not_depend_on_other_birds(fitted):
     alone = fit(observed.select(tracks=[1]), BIRD, dataclasses.replace(CONFIG, error_bars=True))
     np.testing.assert_array_equal(alone.bodies.bone_length[0], together.bodies.bone_length[1])
     np.testing.assert_array_equal(alone.poses.body_pose[0], together.poses.body_pose[1])
+
+
+def test_interrupted_between_the_passes(fitted, tmp_path):
+    observed, solution = fitted
+    settings, add = dataclasses.replace(CONFIG, error_bars=True), StoredWindows.add
+
+    def stopped(self, windows, results, contents):
+        add(self, windows, results, contents)
+        if any(contents.values()):  # of the second pass
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StoredWindows, "add", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            fit(observed, BIRD, settings, stored=StoredWindows(Parts(tmp_path, {})))
+    stored = StoredWindows(Parts(tmp_path, {}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxfit.fitting.tasks.fit_batch", None)  # both passes are stored
+        again = fit(observed, BIRD, settings, stored=stored)
+    assert stored.state == "8 windows fitted"  # four windows in two passes
+    for name, values in solution.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], values, err_msg=name)
 
 
 def test_known_body_is_kept(fitted, tmp_path):

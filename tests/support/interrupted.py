@@ -55,8 +55,8 @@ def stopping(point, stop):
             stop()
         return segment(self, frame)
 
-    def added(self, windows, results):
-        add(self, windows, results)
+    def added(self, windows, results, contents):
+        add(self, windows, results, contents)
         if kind == "windows" and len(self._parts.numbers) == count:
             stop()
 
