@@ -16,6 +16,8 @@ from jaxfit.cameras.camera import Camera
 
 MIN_ANGLE_DEG = 1.0
 """Rays that meet at a smaller angle do not determine a point."""
+PRIOR_FREEDOM = 10.0
+"""Degrees of freedom that the pixel errors of all keypoints of a bird are worth for one keypoint."""
 
 
 class Triangulated(NamedTuple):
@@ -115,6 +117,58 @@ def triangulate_robustly(
     points = triangulate(cameras, points_px, weight * agrees)
     error_px = np.where(weight > 0, reprojection_error_px(cameras, points, points_px), np.nan)
     return Triangulated(points, agrees, error_px)
+
+
+def triangulation_sd(
+    cameras: Sequence[Camera],
+    found: Triangulated,
+    weight: Float[np.ndarray, "V N T K"],
+) -> Float[np.ndarray, "N T K 3"]:
+    """Return standard deviations of triangulated keypoints along the axes of the world, metres; NaN without a point.
+
+    With J the Jacobian of the pixels of a point and D = diag(weight × depth), the direct linear transform is near its
+    result dX = G·dx, G = (Jᵀ·D²·J)⁻¹·Jᵀ·D². Independent errors of pixels with one standard deviation σ give
+
+        Cov(X) = σ²·G·Gᵀ,   E(sum of squared residuals) = σ²·ν,   ν = ‖1 − J·G‖²,
+
+    over the views that agree; ν is 2·views − 3 for equal D. With two views, a point has one degree of freedom, so σ² is
+    that of a keypoint of a bird over all frames, with that of all keypoints of the bird as its prior, worth
+    `PRIOR_FREEDOM` degrees of freedom. Errors that fit a common point in all views leave no residual.
+
+    Args:
+        cameras: V cameras.
+        found: keypoints (N, T, K) of N birds.
+        weight: the weights of the triangulation.
+
+    Source: Hartley and Zisserman 2004, sections 5.1 and 5.2; Smyth 2004, *Linear models and empirical Bayes methods*
+    (the prior of σ²).
+    """
+    known = np.isfinite(found.points_world).all(-1)
+    J, depth = zip(*(_jacobian(camera, found.points_world[known]) for camera in cameras), strict=True)
+    used = found.agrees[:, known]
+    rows = np.moveaxis(np.stack(J) * used[..., None, None], 0, 1)  # (points, V, 2, 3)
+    D2 = np.moveaxis((np.where(used, weight[:, known], 0) * np.stack(depth)) ** 2, 0, 1)
+    weighted = rows * D2[..., None, None]
+    P, V = D2.shape
+    rows, weighted = rows.reshape(P, 2 * V, 3), weighted.reshape(P, 2 * V, 3)
+    G = np.linalg.solve(rows.swapaxes(1, 2) @ weighted, weighted.swapaxes(1, 2))
+    left = np.eye(2 * V) * np.repeat(used.T, 2, axis=1)[:, None] - rows @ G
+    squares, freedom = np.zeros(known.shape), np.zeros(known.shape)
+    squares[known] = np.where(used, found.error_px[:, known] ** 2, 0).sum(axis=0)
+    freedom[known] = (left**2).sum(axis=(1, 2))
+    of_bird = squares.sum(axis=(1, 2)) / np.maximum(freedom.sum(axis=(1, 2)), 1e-9)
+    variance = (squares.sum(axis=1) + PRIOR_FREEDOM * of_bird[:, None]) / (freedom.sum(axis=1) + PRIOR_FREEDOM)
+    sd = np.full(found.points_world.shape, np.nan)
+    sd[known] = np.sqrt((G**2).sum(axis=-1))
+    return sd * np.sqrt(variance)[:, None, :, None]
+
+
+def _jacobian(camera: Camera, points_world: Float[np.ndarray, "P 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (P, 2, 3) of the pixels of a camera without distortion, and the depths (P,) of points."""
+    rows = camera.matrix @ camera.R_cam_world
+    seen = camera.to_camera(points_world) @ camera.matrix.T
+    depth = seen[:, 2]
+    return (rows[:2] - seen[:, :2, None] / depth[:, None, None] * rows[2]) / depth[:, None, None], depth
 
 
 def _wide(cameras: Sequence[Camera], pair: tuple[int, int], points: np.ndarray) -> np.ndarray:

@@ -26,9 +26,9 @@ from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.kinematics import Pose
 
 FORMAT_VERSION = 9
-"""Version of ``poses.npz``; increased when its arrays change. Version 8 lacks `Bodies`, version 7 also `contact`,
-version 6 also `World`, version 5 also `doubts`, version 4 also `ErrorBars`, version 3 also `ambiguity_deg`, version 2
-also `timestamp_s` and `fps`."""
+"""Version of ``poses.npz``; increased when its arrays change. Version 8 lacks `Bodies` and `Triangulated`, version 7
+also `contact`, version 6 also `World`, version 5 also `doubts`, version 4 also `ErrorBars`, version 3 also
+`ambiguity_deg`, version 2 also `timestamp_s` and `fps`."""
 _OLDEST_VERSION = 2
 """Older versions are not read."""
 
@@ -125,6 +125,19 @@ class World(_Arrays):
 
 
 @dataclass(frozen=True, eq=False)
+class Triangulated(_Arrays):
+    """The keypoints of the detections in the world, without the model, where two calibrated cameras agree; else NaN.
+
+    A bird without a pose can have them.
+    """
+
+    keypoints_triangulated_m: Float64[np.ndarray, "N T K 3"]
+    """Metres."""
+    keypoints_triangulated_sd_m: Float64[np.ndarray, "N T K 3"]
+    """Standard deviations along the axes of the world (`cameras.triangulation.triangulation_sd`)."""
+
+
+@dataclass(frozen=True, eq=False)
 class Bodies(_Arrays):
     """One body for each track, from all its windows (`fitting/bodies.py`); NaN for tracks without a fitted window."""
 
@@ -161,9 +174,10 @@ _GROUPS: dict[str, Any] = {
     "flags": Flags,
     "error_bars": ErrorBars,
     "world": World,
+    "triangulated": Triangulated,
     "bodies": Bodies,
 }
-_OPTIONAL = ("error_bars", "world", "bodies")
+_OPTIONAL = ("error_bars", "world", "triangulated", "bodies")
 _OTHER_NAMES = {("keypoints", "cam"): "keypoints_cam", ("keypoints", "px"): "keypoints_px"} | {
     ("crops", "square_px"): "crop"
 }
@@ -193,7 +207,7 @@ LAYOUT: dict[str, tuple[str, Any]] = {
     "status": ("N", np.str_),
 }
 """The arrays of every ``poses.npz``."""
-ERROR_BARS, WORLD, BODIES = (_group_layout(name) for name in _OPTIONAL)
+ERROR_BARS, WORLD, TRIANGULATED, BODIES = (_group_layout(name) for name in _OPTIONAL)
 LEDGE = {"contact": ("N T", np.float32)}
 """The arrays that a ``poses.npz`` may have."""
 
@@ -248,6 +262,8 @@ class Solution:
     """Error bars; None without."""
     world: World | None = None
     """Poses in the world; None for a fit in no world."""
+    triangulated: Triangulated | None = None
+    """Triangulated keypoints; None for a fit of one camera."""
     bodies: Bodies | None = None
     """The bodies of the birds; None for a fit without a stage that shares the body."""
     contact: np.ndarray | None = None
@@ -310,7 +326,7 @@ class Solution:
 
     @property
     def optional_layout(self) -> dict[str, tuple[str, Any]]:
-        """The entries of `ERROR_BARS`, `WORLD`, `BODIES` and `LEDGE` that the solution has."""
+        """The entries of `ERROR_BARS`, `WORLD`, `TRIANGULATED`, `BODIES` and `LEDGE` that the solution has."""
         optional = ((getattr(self, group), _group_layout(group)) for group in _OPTIONAL)
         optional = (*optional, (self.contact, LEDGE))
         return {name: entry for value, layout in optional if value is not None for name, entry in layout.items()}
@@ -371,7 +387,7 @@ def _typed(values: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: an array has another type or shape.
     """
-    layout = LAYOUT | ERROR_BARS | WORLD | BODIES | LEDGE
+    layout = LAYOUT | ERROR_BARS | WORLD | TRIANGULATED | BODIES | LEDGE
     arrays: dict[str, Any] = validate_arrays(values, {name: layout[name] for name in layout if name in values})
     arrays |= {name: tuple(arrays[name].tolist()) for name in _NAMES if name in arrays}
     numbers = {"focal_px": float, "crop_px": int}
@@ -533,7 +549,9 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     folder = check_folder(folder, "a folder of results", _WRITTEN_BY)
     path = check_readable(folder / POSES, "an .npz file", _WRITTEN_BY)
     shapes = {name: shape for name, (shape, _) in LAYOUT.items()} | {"loss": "N L", "loss_terms": "L"}
-    optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | BODIES | LEDGE).items()}
+    optional = {
+        name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | TRIANGULATED | BODIES | LEDGE).items()
+    }
     optional |= {name: shapes.pop(name) for name in ("ambiguity_deg", "doubts")}
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
     terms, loss = arrays.pop("loss_terms"), arrays.pop("loss")

@@ -33,7 +33,7 @@ from jaxfit.data.formats.write_sleap import write_sleap_project
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import projected_observations
 from jaxfit.data.tracks import frame_step
-from jaxfit.export.result import CONFIDENCE, ON_LEDGE, SD, Exported, describe_tracks, export_folder
+from jaxfit.export.result import CONFIDENCE, ON_LEDGE, SD, TRIANGULATED, Exported, describe_tracks, export_folder
 from jaxfit.foundation.errors import InputError, one_line
 from jaxfit.foundation.extras import __version__, require_package
 from jaxfit.foundation.files import write_whole
@@ -111,8 +111,9 @@ def write_movement(
 ) -> tuple[list[Path], list[str]]:
     """Write a netCDF file with `position` (time, space, keypoint, individual) and `confidence`.
 
-    A result with error bars also has `position_sd`, with the dimensions of `position`, except in the world. A result on
-    a ledge also has `on_ledge` (time, individual).
+    A result with error bars also has `position_sd`, with the dimensions of `position`, except in the world. In the
+    world, a result of several cameras also has `position_triangulated` and `position_triangulated_sd`. A result on a
+    ledge also has `on_ledge` (time, individual).
 
     Frame numbers that the result lacks between its first and last frame are frames of NaN, so that the frames have
     equal distances in time. The individual of track 3 has the name `bird_3`.
@@ -169,6 +170,10 @@ def movement_dataset(
     arrays = {"position": (of_position, position, {"units": unit})}
     if sd is not None:
         arrays["position_sd"] = (of_position, in_time(sd.astype(np.float32)), {"units": unit, "description": SD})
+    if space == "world" and s.triangulated is not None:
+        for name, values in vars(s.triangulated).items():
+            about = {"units": "metres", "description": TRIANGULATED}
+            arrays[name.replace("keypoints", "position").removesuffix("_m")] = (of_position, in_time(values), about)
     return xarray.Dataset(
         {
             **arrays,
@@ -419,6 +424,11 @@ def _further_series(exported: Exported, n: int, first: Any) -> list[Any]:
     if exported.solution.world is not None:
         description = f"axes: time, node of the skeleton, (x, y, z). Reference frame: {exported.world_frame}"
         rows.append(("keypoints_world", exported.require_world()[n], "metres", description))
+    if (triangulated := exported.solution.triangulated) is not None:
+        axes = f"axes: time, node of the skeleton, (x, y, z). {exported.world_frame}. {TRIANGULATED}"
+        points, sd = triangulated.keypoints_triangulated_m, triangulated.keypoints_triangulated_sd_m
+        rows.append(("keypoints_triangulated", points[n], "metres", axes))
+        rows.append(("keypoints_triangulated_sd", sd[n], "metres", axes))
     if (contact := exported.contact) is not None:
         rows.append(("on_ledge", contact[n], "n.a.", ON_LEDGE))
     timing, new = _timing(exported, first), _library("pynwb").TimeSeries

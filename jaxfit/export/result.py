@@ -85,6 +85,12 @@ SD = (
     "independent, so with detections of networks these values are too small: 3 to 4 times in a simulated scene"
 )
 """Definition of the standard deviations of an export."""
+TRIANGULATED = (
+    "keypoint of the detections in the world, without the model, where two cameras agree; its standard deviation along "
+    "the axes of the world is that of independent errors of pixels, from the residuals, and contains no error that the "
+    "views share"
+)
+"""Definition of the triangulated keypoints of an export."""
 
 FPS_RANGE = 0.001, 100_000
 """Smallest and largest frame rate that a user can give, frames per second."""

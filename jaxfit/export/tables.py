@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxfit.data.flags import doubt_texts, flags
 from jaxfit.data.world import in_frame_of_camera
-from jaxfit.export.result import CONFIDENCE, ON_LEDGE, SD, Exported
+from jaxfit.export.result import CONFIDENCE, ON_LEDGE, SD, TRIANGULATED, Exported
 from jaxfit.foundation.extras import require_package
 from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.progress import ProgressTask
@@ -108,6 +108,14 @@ def _pose_columns(exported: Exported) -> Columns:
         for name, values in world.items():
             for i, axis in enumerate("xyz"):  # in float64: a world may have its origin far away
                 columns[f"{name}_{axis}_world_m"] = np.where(s.valid, values[..., i], np.nan).reshape(-1)
+    if s.triangulated is not None:
+        for k, name in enumerate(s.keypoint_names):
+            for end, values in (
+                ("triangulated_m", s.triangulated.keypoints_triangulated_m),
+                ("triangulated_sd_m", s.triangulated.keypoints_triangulated_sd_m),
+            ):
+                for i, axis in enumerate("xyz"):
+                    columns[f"{name}_{axis}_{end}"] = values[:, :, k, i].reshape(-1)
     return columns
 
 
@@ -166,6 +174,8 @@ def _facts_of_space(exported: Exported) -> dict[str, str]:
     }
     if s.world is not None:
         facts["world"] = f"{exported.world_frame}, metres"
+    if s.triangulated is not None:
+        facts["triangulated"] = TRIANGULATED
     return facts | ({} if s.contact is None else {"on_ledge": ON_LEDGE})
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
-from jaxfit.cameras.triangulation import Triangulated
+from jaxfit.cameras.triangulation import Triangulated, triangulation_sd
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.data.flags import with_doubts_of_views
 from jaxfit.data.observations import Observations
@@ -168,6 +168,8 @@ def fit_views(
         fitted = blend_seams(windows, fitted, model)
     skipped = without_orientation(prepared[0], points, has_pose)
     solution = _solution(views, prepared[0], windows, fitted, bird, origin_m, unit_m, skipped)
+    sd_m = triangulation_sd(views.cameras, found, keypoints.confidence)
+    solution = solution.with_arrays(keypoints_triangulated_m=found.points_world, keypoints_triangulated_sd_m=sd_m)
     if estimated:
         solution = solution.with_arrays(**body_arrays(estimated, birds, bird, config))
     seen = ((in_camera(solution, bird, camera), own) for camera, own in zip(views.cameras, checked, strict=True))

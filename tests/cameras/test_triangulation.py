@@ -11,6 +11,7 @@ from jaxfit.cameras.triangulation import (
     reprojection_error_px,
     triangulate,
     triangulate_robustly,
+    triangulation_sd,
 )
 
 RNG = np.random.default_rng(0)
@@ -102,3 +103,39 @@ def test_epipolar_error_is_the_reprojection_error_of_the_best_point():
     points = triangulate(RIG[:2], noisy, WEIGHT[:2])
     expected = np.sqrt((reprojection_error_px(RIG[:2], points, noisy) ** 2).sum(0))
     assert epipolar_error_px(F, noisy[0], noisy[1]) == pytest.approx(expected, rel=0.05, abs=0.02)
+
+
+def staged(noise_px, draws=400, views=(0, 1, 2, 3), seed=1):
+    """Triangulate ten keypoints of one bird in many frames, whose pixels have independent errors."""
+    rig = [RIG[v] for v in views]
+    pixels = np.stack([camera.project(POINTS[:10]) for camera in rig])[:, None, None]
+    errors = np.random.default_rng(seed).normal(size=(len(rig), 1, draws, 10, 2)) * noise_px
+    weight = np.broadcast_to([1, 0.5, 1, 0.7], (1, 1, 1, 4)).T[list(views)] * np.ones(errors.shape[:-1])
+    return rig, triangulate_robustly(rig, pixels + errors, weight, np.full(weight.shape, 60.0)), weight
+
+
+@pytest.mark.parametrize("views", [(0, 1), (0, 1, 2, 3)])
+def test_standard_deviations_are_those_of_repeated_measurements(views):
+    """Keypoints differ in their noise, views in their weights and distances."""
+    noise_px = np.linspace(1, 4, 10)[:, None]
+    rig, found, weight = staged(noise_px, views=views)
+    sd = triangulation_sd(rig, found, weight)
+    np.testing.assert_allclose(sd.mean(axis=1), found.points_world.std(axis=1), rtol=0.12)
+
+
+def test_points_of_one_view_have_no_standard_deviation_and_change_no_other():
+    rig, found, weight = staged(1.0, draws=5)
+    expected = triangulation_sd(rig, found, weight)
+    assert (triangulation_sd(rig, staged(0.0, draws=5)[1], weight) < 1e-9).all()
+    alone = weight.copy()
+    alone[1:, 0, 2, 3] = 0  # one camera sees a keypoint
+    pixels = np.stack([camera.project(found.points_world) for camera in rig]) + 0.0
+    lost = triangulate_robustly(rig, pixels, alone, np.full(weight.shape, 60.0))
+    sd = triangulation_sd(rig, lost, alone)
+    assert np.isnan(sd[0, 2, 3]).all()
+    assert np.isfinite(sd).all(-1).sum() == 49
+    # in a frame of two views, errors are larger
+    agrees = found.agrees.copy()
+    agrees[2:, 0, 0] = False
+    fewer = triangulation_sd(rig, found._replace(agrees=agrees), weight)
+    assert (np.linalg.norm(fewer[0, 0], axis=-1) > np.linalg.norm(expected[0, 0], axis=-1)).all()

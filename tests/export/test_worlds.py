@@ -30,6 +30,9 @@ def made(scene, camera):
     placed = placed_on(scene, camera)
     valid = placed.valid.copy()
     valid[0, 0] = False
+    points = np.random.default_rng(0).normal(size=placed.keypoints.cam.shape)
+    points[1, 2, 3] = np.nan
+    placed = placed.with_arrays(keypoints_triangulated_m=points, keypoints_triangulated_sd_m=np.abs(points) / 50)
     return replace(placed, valid=valid, contact=np.linspace(0, 1, valid.size).reshape(valid.shape))
 
 
@@ -62,6 +65,11 @@ def test_tables(folder, without_ledge, made, tmp_path):
         # the camera frame has the true size, too
         expected = known(made, made.keypoints.cam[:, :, 0, i] * UNIT)
         np.testing.assert_allclose(column(f"{made.keypoint_names[0]}_{axis}_m"), expected, rtol=1e-5, atol=1e-5)
+        # without the model, in rows without a pose too
+        for end, points in zip(("m", "sd_m"), vars(made.triangulated).values(), strict=True):
+            for k in (0, 3):
+                name = f"{made.keypoint_names[k]}_{axis}_triangulated_{end}"
+                np.testing.assert_array_equal(column(name), points[:, :, k, i])
     jaxfit.export_result(without_ledge, "csv", tmp_path / "views.csv")
     header = (tmp_path / "views.csv").read_text().partition("\n")[0].split(",")
     assert "on_ledge" not in header
@@ -93,6 +101,11 @@ def test_movement(folder, without_ledge, made, tmp_path):
         np.testing.assert_array_equal(position.values, known(made, made.world.keypoints_world_m))
         assert data.position.attrs["units"] == "metres"
         assert data.attrs["position_frame"] == "world, z up"
+        for name, points in (
+            ("position_triangulated", made.triangulated.keypoints_triangulated_m),
+            ("position_triangulated_sd", made.triangulated.keypoints_triangulated_sd_m),
+        ):
+            np.testing.assert_array_equal(data[name].transpose("individual", "time", "keypoint", "space"), points)
         assert data.on_ledge.dims == ("time", "individual")
         np.testing.assert_array_equal(data.on_ledge.values.T, known(made, made.contact))
     with xarray.open_dataset(tmp_path / "views.nc", engine="h5netcdf") as data:
@@ -114,6 +127,10 @@ def test_nwb(folder, made, tmp_path):
             world, on_ledge = behaviour["keypoints_world"], behaviour["on_ledge"]
             np.testing.assert_array_equal(world.data[:], known(made, made.world.keypoints_world_m)[n])
             np.testing.assert_array_equal(on_ledge.data[:], known(made, made.contact)[n])
+            points = behaviour["keypoints_triangulated"].data[:]
+            np.testing.assert_array_equal(points, made.triangulated.keypoints_triangulated_m[n])
+            points = behaviour["keypoints_triangulated_sd"].data[:]
+            np.testing.assert_array_equal(points, made.triangulated.keypoints_triangulated_sd_m[n])
             assert (world.unit, world.rate) == ("metres", made.fps)
             assert world.description.endswith("Reference frame: world, z up")
             assert on_ledge.description.startswith("probability that the bird stands")

@@ -84,6 +84,12 @@ def test_exact_keypoints_give_the_birds_in_the_world(rig, solution, truth_m):
     assert np.abs(solution.world.transl_world_m - true_root).max() < 0.015
 
 
+def test_triangulated_keypoints_are_stored_beside_those_of_the_model(solution, truth_m):
+    found = solution.triangulated
+    assert np.abs(found.keypoints_triangulated_m - truth_m).max() < 0.0002
+    assert found.keypoints_triangulated_sd_m.max() < 0.0002
+
+
 def test_the_pose_in_the_first_camera_is_the_pose_in_the_world(rig, solution):
     camera = rig.cameras[0]
     np.testing.assert_allclose(
@@ -132,6 +138,9 @@ def test_a_bird_that_one_camera_sees_has_no_pose(rig):
     assert found.valid[0].all()
     assert not found.valid[1].any()
     assert found.status.tolist() == ["ok", "no usable frame"]
+    assert np.isfinite(found.triangulated.keypoints_triangulated_m[0]).all()
+    assert np.isnan(found.triangulated.keypoints_triangulated_m[1]).all()
+    assert np.isnan(found.triangulated.keypoints_triangulated_sd_m[1]).all()
     assert found.failures == {2: ("not fitted: no frame has 4 keypoints that two cameras agree on",)}
     with pytest.raises(InputError, match="have no bird with 21 keypoints in two cameras"):
         fit_views(views, BIRD, replace(quick, min_keypoints=21))
