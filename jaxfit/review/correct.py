@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,10 +53,12 @@ def refit(
     """Fit the corrected observations, but only windows that no window of the earlier fit equals.
 
     Two windows are equal if they have the same frames, crops, filtered keypoints, confidences and masks. The fit of a
-    window does not depend on other windows, so the result is that of a fit of all corrected observations, with the
-    bodies of the earlier result for the tracks that it has. The poses of
+    window does not depend on other windows, so the result is that of a fit of all corrected observations. The poses of
     an equal window are copied bit by bit, also if its track has another number now. Where windows share frames
     (`overlap`), a window is copied only if its neighbours are equal too.
+
+    Bodies: a track keeps the body of the track of the earlier result from which most of its equal windows come. Equal
+    windows with another body are fitted again.
 
     Args:
         solution: the earlier result.
@@ -77,12 +80,17 @@ def refit(
     old, new = windows_of(before, config, source), windows_of(after, config, source)
     rows = {window_hash(old, w): w for w in range(len(old))}
     source_row = np.array([rows.get(window_hash(new, w), -1) for w in range(len(new))])
+    earlier, bodies, kept = bodies_of(solution, config), {}, {}
+    if earlier:
+        kept = _origins(source_row, old, new)
+        bodies = {track: earlier[origin] for track, origin in kept.items() if origin in earlier}
+        origin_now = np.array([kept[track] for track in new.track_id.tolist()])
+        source_row[(source_row >= 0) & (old.track_id[source_row] != origin_now)] = -1
     if config.overlap_frames:
         source_row = _with_equal_neighbours(source_row, old, new)
     touched = np.flatnonzero(source_row < 0)
     result = _empty(solution, after)
     if len(touched):
-        bodies = bodies_of(solution, config)
         result = fit_runs(after, bird, [config], None, progress, source, select=touched, bodies=bodies)[0]
     with_bars = result.error_bars is not None or solution.error_bars is not None
     copied = solution.cells(with_bars)
@@ -118,7 +126,7 @@ def refit(
                     loss[term][n] = solution.loss[term][_row_of(solution, track)]
     merged = result.with_arrays(
         **arrays,
-        **_merged_bodies(result, solution),
+        **_merged_bodies(result, solution, kept),
         loss=loss,
         status=np.array([track_status(*count) for count in counts.tolist()], "<U32"),
         failures={track: tuple(texts) for track, texts in failures.items()},
@@ -129,7 +137,17 @@ def refit(
     return Refit(merged, fitted, len(new))
 
 
-def _merged_bodies(result: Solution, earlier: Solution) -> dict[str, np.ndarray]:
+def _origins(source_row: np.ndarray, old: Windows, new: Windows) -> dict[int, int]:
+    """Return new track → the earlier track from which most of its equal windows come; without equal windows, itself."""
+    origins = {}
+    for track in dict.fromkeys(new.track_id.tolist()):
+        rows = source_row[(new.track_id == track) & (source_row >= 0)]
+        sources = Counter(old.track_id[rows].tolist())
+        origins[track] = sources.most_common(1)[0][0] if sources else track
+    return origins
+
+
+def _merged_bodies(result: Solution, earlier: Solution, origins: Mapping[int, int]) -> dict[str, np.ndarray]:
     """Return the arrays of the bodies: those of the earlier result, and of the new result for its new tracks."""
     if earlier.bodies is None:
         return {}
@@ -138,8 +156,11 @@ def _merged_bodies(result: Solution, earlier: Solution) -> dict[str, np.ndarray]
         empty = np.full((len(result.track_id), *before[name].shape[1:]), np.nan, np.float32)
         merged[name] = now.get(name, empty).copy()
         for n, track in enumerate(result.track_id.tolist()):
-            if track in earlier.track_id:
-                merged[name][n] = before[name][_row_of(earlier, track)]
+            origin = origins.get(track)
+            if origin is not None and origin in earlier.track_id:
+                row = _row_of(earlier, origin)
+                if np.isfinite(before["body_frames"][row]):
+                    merged[name][n] = before[name][row]
     return merged
 
 
@@ -170,6 +191,7 @@ def _empty(solution: Solution, observations: Observations) -> Solution:
         filler = np.nan if values.dtype.kind == "f" else 0
         arrays[name] = np.full((count, *values.shape[1:]), filler, values.dtype)
     status = np.full(count, "no usable frame")
+    arrays |= dict.fromkeys(BODIES)
     return solution.with_arrays(**arrays, track_id=observations.track_id, status=status, loss={}, failures={})
 
 
