@@ -66,7 +66,7 @@ def fit(options: argparse.Namespace) -> None:
         raise InputError(options.observations, "holds photographs, which show no common ledge", "leave out --ledge")
     config = _fewer_keypoints(config, names, options)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
-    bodies = _known_bodies(options, config, observations.track_id.tolist())
+    bodies = _known_bodies(options, config, bird, observations.track_id.tolist())
     read_s = time.perf_counter() - start
     with open_cluster(options.workers, options.scheduler) as cluster:
         source, learnt = options.observations, None
@@ -85,11 +85,14 @@ def fit(options: argparse.Namespace) -> None:
     _write_fit(options, config, bird, solution, None, seconds, facts, subject, learnt and learnt.to_yaml())
 
 
-def _known_bodies(options: argparse.Namespace, config: FitConfig, tracks: list[int]) -> dict[int, Body] | None:
+def _known_bodies(
+    options: argparse.Namespace, config: FitConfig, bird: Bird, tracks: list[int]
+) -> dict[int, Body] | None:
     """Return the bodies of the result that the options name.
 
     Raises:
-        InputError: the result has no bodies, or none of these tracks, or the config uses no bodies.
+        InputError: the result has no bodies, or none of these tracks, or bodies of another model; or the config uses no
+            bodies, or fixes the shape, which the bodies of the result do not.
     """
     from jaxfit.data.solution import load_solution
     from jaxfit.fitting.bodies import bodies_of
@@ -99,7 +102,16 @@ def _known_bodies(options: argparse.Namespace, config: FitConfig, tracks: list[i
     if not any(stage.share_body for stage in config.stages):
         problem = "has no stage that uses the body of a bird"
         raise InputError(f"config {options.config}", problem, "choose a config with `share_body`, such as `map`")
-    bodies = bodies_of(load_solution(options.body)[0], config)
+    solution, own = load_solution(options.body)
+    same = own.joint_names == bird.joint_names
+    same = same and all(np.array_equal(getattr(own, name), getattr(bird, name)) for name in ("joints", "shape_basis"))
+    if not same:
+        raise InputError(options.body, f"has the bodies of another model, {own.name}", "give a result of this model")
+    bodies = bodies_of(solution, config)
+    has_shapes = any(body.betas.any() for body in bodies.values())
+    if has_shapes and not any(stage.share_body and "betas" in stage.optimised for stage in config.stages):
+        problem = "has bodies with a shape, but no stage of the config shares the shape"
+        raise InputError(options.body, problem, "choose a config that shares `betas`, such as `map`")
     if not bodies.keys() & set(tracks):
         known = f"has the bodies of tracks {sorted(bodies)}" if bodies else "has no bodies"
         raise InputError(options.body, known, f"give a result with bodies of tracks {tracks}")
@@ -208,7 +220,7 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
         show(f"model {bird.name} has no unit of length: measured by the cameras, bill to tail {length_cm:.1f} cm")
     bird = measured
     tracks = np.unique(np.concatenate([own.track_id for own in read.views.observations])).tolist()
-    bodies = _known_bodies(options, config, tracks)
+    bodies = _known_bodies(options, config, bird, tracks)
     read_s = time.perf_counter() - start
     with open_cluster(options.workers, options.scheduler) as cluster:
         solution = fit_views(read.views, bird, config, terminal, source, cluster, bodies)

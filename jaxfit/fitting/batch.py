@@ -146,8 +146,9 @@ def fit_batch(
         if batch.body_covariance is not None:
             names = shared_parameters(configs[0].stages[stages[0] - 1])
             covariance = batch.body_covariance[batch.pose_row[first]]
-            used = replace(stage, optimised=(*stage.optimised, *names))
-            hyperparameters = [stage_hyperparameters(c, used, model.bird.keypoint_names) for c in configs]
+            own = [replace(c.stages[last], optimised=(*c.stages[last].optimised, *names)) for c in configs]
+            pairs = zip(configs, own, strict=True)
+            used, hyperparameters = own[0], [stage_hyperparameters(*pair, model.bird.keypoint_names) for pair in pairs]
         run = _stage_run(used, with_shared(program, used), rows, hyperparameters, batch, first)
         bars = _error_bars(run, rows, configs[0].common_size, covariance)
     fitted = FittedWindow(

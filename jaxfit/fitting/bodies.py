@@ -4,9 +4,10 @@ A stage with `share_body` optimises bone lengths and shape in every window, with
 let A be the marginal precision of these numbers b (the poses integrated out, `fitting/posterior.py`), P the precision
 of the prior with the mean μ, and m the optimum. The data of the window then say
 
-    I = A − P,   s = A·(m − μ),
+    I = A − P,   s = (A − Q)·(m − μ),
 
-information and score about b − μ. The windows of a track are added, and the body is the mean of
+information and score about b − μ. Q is the precision of the broad prior, which A and P contain, and the optimum does
+not. The windows of a track are added, and the body is the mean of
 
     b − μ ~ N(Σ·s, Σ),   Σ = (P + κ·ΣI)⁻¹,   s = κ·Σs.
 
@@ -106,9 +107,12 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> list[BodyE
         precision = np.full((len(mean), len(mean)), np.nan)
         if not isinstance(posterior, str):
             # the inverse of the block of H⁻¹ integrates the poses and the size out; the body is its last columns
-            precision = np.linalg.inv(posterior.factors.corner[-len(mean) :, -len(mean) :])
+            corner = posterior.factors.corner
+            precision = np.linalg.inv(corner[len(corner) - len(mean) :, len(corner) - len(mean) :])
         targets = problems.targets
         seen = np.asarray(targets.confidence[b] > 0) & np.asarray(targets.present[b])[:, None]
+        on = np.asarray(problems.hyperparameters.keypoints_on[b])
+        seen &= np.tile(on > 0, seen.shape[1] // len(on))  # of all views
         error = np.where(seen[..., None], fitted_px[b] - np.asarray(targets.keypoints_px[b]), 0)
         length = np.linalg.norm(error, axis=-1)
         longest = LONGEST * np.median(length[seen]) if seen.any() else 0.0
@@ -132,7 +136,7 @@ def estimate_bodies(
         config: the config, whose shared stage has the weights of the priors.
     """
     stage = config.stages[stages_of_pass(config, has_bodies=False)[-1]]
-    mean, precision = _prior(bird, config, stage)
+    mean, precision, broad = _prior(bird, config, stage)
     prior = _symmetric(precision, bird, stage)
     usable = [w for w, each in enumerate(evidence) if each is not None and np.isfinite(each.precision).all()]
     bodies = {}
@@ -141,7 +145,7 @@ def estimate_bodies(
         information, score, frames = np.zeros_like(precision), np.zeros_like(mean), 0.0
         for each in own:
             information += each.precision - precision
-            score += each.precision @ (each.mean - mean)
+            score += (each.precision - broad) @ (each.mean - mean)
             frames += each.errors.max(initial=0)
         # rounding and ridges may leave slightly negative directions, which say nothing
         values, vectors = np.linalg.eigh((information + information.T) / 2)
@@ -155,22 +159,26 @@ def estimate_bodies(
     return bodies
 
 
-def _prior(bird: Bird, config: FitConfig, stage: StageConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and precision of the prior of the numbers that the stage optimises, as the fit counts it."""
+def _prior(bird: Bird, config: FitConfig, stage: StageConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mean and precision of the prior of the numbers that the stage optimises, and the part of the broad prior.
+
+    The posterior of a window contains the broad prior (`posterior.broad_precision`), but the fit does not.
+    """
     settings, priors = config.stage_settings(stage), priors_of(bird)
     whitener, shape_sd = (np.asarray(each, np.float64) for each in (priors.bone_whitener, priors.shape_sd))
-    # a term w·‖W(b − μ)‖² in nats has the precision 2w·WᵀW; the broad prior of the posterior comes on top
+    # a term w·‖W(b − μ)‖² in nats has the precision 2w·WᵀW
     of = {
         "bone_length": (priors.bone_mean, "bone_prior", whitener.T @ whitener, 1.0),
         "betas": (np.zeros(len(shape_sd)), "shape_prior", np.diag(shape_sd**-2), 0.01),
     }
-    means, blocks = [], []
+    means, blocks, broad_blocks = [], [], []
     for name in shared_parameters(stage):
         mean, term, precision, broad = of[name]
         means.append(np.asarray(mean, np.float64))
         weight = settings.get(term, {}).get("weight", 0.0)
-        blocks.append(2 * weight * precision + broad * np.eye(len(precision)))
-    return np.concatenate(means), np.asarray(block_diag(*blocks))
+        broad_blocks.append(broad * np.eye(len(precision)))
+        blocks.append(2 * weight * precision + broad_blocks[-1])
+    return np.concatenate(means), np.asarray(block_diag(*blocks)), np.asarray(block_diag(*broad_blocks))
 
 
 def _symmetric(precision: Float[np.ndarray, "P P"], bird: Bird, stage: StageConfig) -> Float[np.ndarray, "P P"]:

@@ -244,12 +244,13 @@ def fit_windows(
         evidence = [None if windows[r, w].failure else windows[r, w].body for w in rows]
         bodies.append(estimate_bodies(of_run.track[rows], evidence, model.bird, config) | dict(known or {}))
         for w in rows:
-            fitted, body = windows[r, w], bodies[r][int(of_run.track[w])]
+            fitted, body = windows.pop((r, w)), bodies[r][int(of_run.track[w])]
             if fitted.failure:  # no later stage: the loss has the terms of the last stage
                 loss = dict.fromkeys(sorted(config.stages[-1].terms), float("nan"))
                 windows[r, w] = fitted._replace(loss=loss, body=None)
                 continue
-            pose = replace(fitted.pose, bone_length=body.bone_length, betas=body.betas)
+            betas = body.betas[: len(fitted.pose.betas)]  # none for a fit without shape coefficients
+            pose = replace(fitted.pose, bone_length=body.bone_length, betas=betas)
             starts[r, w] = Start(pose, fitted.ambiguity_deg, body.covariance)
     if starts:
         second = task._replace(problems=[problem for problem in task.problems if problem in starts], starts=starts)

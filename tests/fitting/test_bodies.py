@@ -1,23 +1,27 @@
 """One body for each track: the estimate against dense algebra, its use in a fit, and its way through files."""
 
+import argparse
 import dataclasses
 
 import jax
 import numpy as np
 import pytest
-from support.birds import tiny_bird
+from support.birds import tiny_bird, toy_bird
 from support.fits import CAMERA, T, config
 
+from jaxfit.cli.fitting import _known_bodies
 from jaxfit.config.build import with_values
-from jaxfit.config.fit import StageConfig
+from jaxfit.config.fit import StageConfig, load_config
 from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.fitting.bodies import ASYMMETRY_SD, BodyEvidence, bodies_of, estimate_bodies
 from jaxfit.fitting.error_bars import _with_body
-from jaxfit.fitting.fit import fit
+from jaxfit.fitting.fit import fit, fit_runs
 from jaxfit.fitting.posterior import BodySensitivity
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.unfinished import Parts
+from jaxfit.review.correct import refit
+from jaxfit.review.edits import Edit, apply_edits
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
 
@@ -87,8 +91,8 @@ def test_body_is_the_posterior_of_all_windows():
     rows, right, windows = [np.linalg.cholesky(symmetric).T], [np.linalg.cholesky(symmetric).T @ mean], []
     for _ in range(3):
         J, y = rng.standard_normal((20, BONES)), rng.standard_normal(20)
-        A = J.T @ J + prior
-        windows.append(evidence(np.linalg.solve(A, J.T @ y + prior @ mean), A, white))
+        A, broad = J.T @ J + prior, np.eye(BONES)  # the posterior has a broad prior, the fit has none
+        windows.append(evidence(np.linalg.solve(A - broad, J.T @ y + (prior - broad) @ mean), A, white))
         rows.append(J)
         right.append(y)
     expected = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
@@ -184,6 +188,78 @@ def test_known_body_is_kept(fitted, tmp_path):
     assert (again.poses.bone_length[1] == 1.25).all()
 
 
+def test_bodies_of_another_model_are_refused(fitted, tmp_path):
+    save_solution(fitted[1], BIRD, "", {}, tmp_path / "result")
+    options = argparse.Namespace(body=tmp_path / "result", config="own")
+    assert list(_known_bodies(options, CONFIG, BIRD, [1])) == [0, 1]
+    for bird in (toy_bird(shapes=0), tiny_bird(shapes=2)):
+        with pytest.raises(InputError, match="another model, tiny"):
+            _known_bodies(options, CONFIG, bird, [1])
+
+
+def test_a_shape_that_the_config_fixes_is_refused(fitted, tmp_path):
+    solution, bird = fitted[1], tiny_bird(shapes=2)
+    cells, shape = solution.valid.shape, np.ones((2, 2), np.float32)
+    solution = solution.with_arrays(
+        betas=np.ones((*cells, 2), np.float32),
+        body_betas=shape,
+        body_betas_sd=shape,
+        betas_sd=np.ones((*cells, 2), np.float32),
+    )
+    save_solution(solution, bird, "", {}, tmp_path / "result")
+    options = argparse.Namespace(body=tmp_path / "result", config="own")
+    with pytest.raises(InputError, match="bodies with a shape"):
+        _known_bodies(options, CONFIG, bird, [1])
+    assert bodies_of(solution, with_values(load_config("map"), {}))[1].betas.tolist() == [1, 1]
+
+
+def test_several_configs_keep_their_settings(fitted):
+    """Error bars too have the settings of their own config."""
+    observed, first = fitted
+    own = dataclasses.replace(CONFIG, error_bars=True)
+    last = dataclasses.replace(own.stages[-1], override={"keypoint_likelihood": {"sd_sure_px": 1.5}})
+    other = dataclasses.replace(own, stages=(*own.stages[:-1], last))
+    solutions = fit_runs(observed, BIRD, [own, other])
+    for found, expected in zip(solutions, (first, fit(observed, BIRD, other)), strict=True):
+        for name, values in expected.arrays().items():
+            np.testing.assert_array_equal(found.arrays()[name], values, err_msg=name)
+
+
+def test_keypoints_that_are_off_say_nothing_about_a_body(fitted):
+    observed, _ = fitted
+    name = BIRD.keypoint_names[-1]
+    off = dataclasses.replace(CONFIG, stages=tuple(dataclasses.replace(s, keypoints_off=(name,)) for s in stages()))
+    points = observed.keypoints_px.copy()
+    points[:, :, -1] += 3  # px
+    expected, moved = (
+        fit(each, BIRD, off) for each in (observed, observed.with_keypoints(points, observed.confidence))
+    )
+    np.testing.assert_allclose(moved.bodies.frames, expected.bodies.frames, rtol=0.15)  # the search sees all keypoints
+
+
+def test_corrected_tracks_keep_the_body_of_their_windows(fitted):
+    observed, solution = fitted
+    settings, second = dataclasses.replace(CONFIG, error_bars=True), int(observed.frame_index[T])
+    # the windows of the new track 2 are copied, with the body of track 0
+    cut = apply_edits(observed, [Edit("cut", (0,), second)], "x")
+    done = refit(solution, observed, cut, BIRD, settings)
+    assert not done.fitted
+    for name in ("bone_length", "bone_length_sd", "frames"):
+        np.testing.assert_array_equal(getattr(done.solution.bodies, name), getattr(solution.bodies, name)[[0, 1, 0]])
+    # the last windows of two birds change places: the body of the first windows stays, and the others are fitted again
+    swapped = apply_edits(observed, [Edit("swap", (0, 1), second)], "x")
+    done = refit(solution, observed, swapped, BIRD, settings)
+    last = observed.frame_index[-1]
+    assert done.fitted == [(0, second, last), (1, second, last)]
+    np.testing.assert_array_equal(done.solution.bodies.bone_length, solution.bodies.bone_length)
+    assert (done.solution.poses.bone_length == solution.bodies.bone_length[:, None]).all()
+    # a new number only
+    swapped = apply_edits(observed, [Edit("swap", (0, 1), int(observed.frame_index[0]))], "x")
+    done = refit(solution, observed, swapped, BIRD, settings)
+    assert not done.fitted
+    np.testing.assert_array_equal(done.solution.bodies.bone_length, solution.bodies.bone_length[::-1])
+
+
 def test_error_bars_with_a_body_are_those_of_the_joint_precision():
     rng = np.random.default_rng(3)
     L, P = 5, 3
@@ -211,7 +287,6 @@ def test_wrong_use_of_a_shared_body_names_the_stage(changes, key):
 
 
 def test_without_masks_the_body_keeps_its_stages():
-    from jaxfit.config.fit import load_config
     from jaxfit.fitting.solve import without_mask_stages
 
     left = without_mask_stages(with_values(load_config("map"), {}))
