@@ -11,7 +11,7 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -48,7 +48,7 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.workers import Cluster
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints, rest_pose
+from jaxfit.model.kinematics import fold_bird, rest_pose, window_keypoints, window_transforms
 from jaxfit.model.rotation import unwrap_axis_angle
 from jaxfit.objective.posed_window import ViewMaps
 
@@ -56,6 +56,8 @@ MIN_POINTS = 4
 """Triangulated keypoints of a frame that determine an orientation."""
 MIN_SPREAD = 0.05
 """Smallest ratio of the second to the first extent of the triangulated keypoints: points on a line have no rotation."""
+POSTURE_AXES, POSTURE_SDS = 3, (-3.0, -1.5, 1.5, 3.0)
+"""Axes of the pose prior, with the largest variance first, and standard deviations of the initial body poses."""
 ROUNDS = 5
 """Rounds of reweighting of the alignment, and `ROBUST` its scale relative to the extent of the bird."""
 ROBUST = 0.08
@@ -105,7 +107,7 @@ def with_unit(views: Views, bird: Bird, source: object = "observations") -> Bird
         return replace(bird, metres_per_unit=metres(bird))
     keypoints = stacked_keypoints([check_observations(own, bird, source) for own in views.observations])
     found = keypoints.triangulated(views.cameras)
-    unit_m = float(np.nanmedian(_alignments(bird, found.points_world, _weights(keypoints, found), source)[1]))
+    unit_m = float(np.nanmedian(_alignments(bird, found.points_world, _weights(keypoints, found), source).scale))
     extent = np.ptp(np.asarray(bird.vertices, np.float64), axis=0).max()
     if not POSSIBLE_LENGTHS_M[0] < unit_m * extent < POSSIBLE_LENGTHS_M[1]:
         problem = f"show birds of {unit_m * extent:.3g} m"
@@ -203,7 +205,7 @@ def _weights(keypoints: ViewKeypoints, found: Triangulated) -> Float[np.ndarray,
 def initial_poses(
     bird: Bird, points: Float[np.ndarray, "N T K 3"], weight: Float[np.ndarray, "N T K"], source: object
 ) -> InitialPoses:
-    """Return initial poses: the mean pose of the prior, aligned with the triangulated keypoints of each frame.
+    """Return initial poses: that of some postures of the prior which agrees best with the keypoints of each frame.
 
     The size of a bird is the median over its frames. Frames whose keypoints do not determine the orientation have no
     pose (NaN).
@@ -219,7 +221,7 @@ def initial_poses(
 
     Source: Umeyama 1991, *Least-squares estimation of transformation parameters between two point patterns*.
     """
-    R, scale, shape = _alignments(bird, points, weight, source)
+    R, scale, body_pose, shape = _alignments(bird, points, weight, source)
     rest, root = rest_pose(bird), np.asarray(bird.joints[0], np.float64)
     N, T = weight.shape[:2]
     transl = np.full((N, T, 3), np.nan)
@@ -236,7 +238,7 @@ def initial_poses(
         scale[n] = size
         for t in np.flatnonzero(known).tolist():
             w = weight[n, t][:, None]
-            posed = size * ((shape - root) @ R[n, t].T + root)
+            posed = size * ((shape[n, t] - root) @ R[n, t].T + root)
             transl[n, t] = (w * (np.nan_to_num(points[n, t]) - posed)).sum(0) / w.sum()
         if known.any():
             rotations = Rotation.from_matrix(R[n, known]).as_rotvec()
@@ -249,7 +251,7 @@ def initial_poses(
     return InitialPoses(
         str(source),
         global_orient=orient.astype(np.float32),
-        body_pose=everywhere(rest.body_pose, bones, 3),
+        body_pose=body_pose.astype(np.float32),
         transl=transl.astype(np.float32),
         scale=scale.astype(np.float32),
         bone_length=everywhere(rest.bone_length, bones),
@@ -257,49 +259,85 @@ def initial_poses(
     )
 
 
+class _Aligned(NamedTuple):
+    """The posture that agrees best with the keypoints of each bird and frame, and its place; NaN if not determined."""
+
+    R: Float[np.ndarray, "N T 3 3"]
+    scale: Float[np.ndarray, "N T"]
+    body_pose: Float[np.ndarray, "N T bones 3"]
+    keypoints: Float[np.ndarray, "N T K 3"]
+    """The keypoints of the posture, without rotation."""
+
+
 def _alignments(
     bird: Bird, points: Float[np.ndarray, "N T K 3"], weight: Float[np.ndarray, "N T K"], source: object
-) -> tuple[Float[np.ndarray, "N T 3 3"], Float[np.ndarray, "N T"], Float[np.ndarray, "K 3"]]:
-    """Return rotation and scale of the mean pose in each frame (NaN: not determined), and the keypoints of this pose.
+) -> _Aligned:
+    """Align postures with the keypoints of each frame, and return the best; the mean pose where nothing is known.
 
     Raises:
         InputError: no frame has enough keypoints.
     """
-    rig, rest = fold_bird(bird), rest_pose(bird)
-    shape = np.asarray(posed_keypoints(rig, joint_transforms(rig, rest), rest), np.float64)
-    N, T = weight.shape[:2]
-    R, scale = np.full((N, T, 3, 3), np.nan), np.full((N, T), np.nan)
-    for n, t in np.argwhere((weight > 0).sum(-1) >= MIN_POINTS).tolist():
-        found = _align(shape, np.nan_to_num(points[n, t]), weight[n, t])
-        if found is not None:
-            R[n, t], scale[n, t] = found
-    if not np.isfinite(scale).any():
+    body_pose, keypoints, cost = _postures(bird)
+    known = (weight > 0).sum(-1) >= MIN_POINTS
+    found = [_align(shape, np.nan_to_num(points[known]), weight[known]) for shape in keypoints]
+    R, scale, error = (np.stack(each) for each in zip(*found, strict=True))
+    best = np.argmin(error + cost[:, None], axis=0)
+    at = best, np.arange(len(best))
+    aligned = _Aligned(
+        np.full((*known.shape, 3, 3), np.nan),
+        np.full(known.shape, np.nan),
+        np.broadcast_to(body_pose[0], (*known.shape, *body_pose.shape[1:])).copy(),
+        np.broadcast_to(keypoints[0], (*known.shape, *keypoints.shape[1:])).copy(),
+    )
+    for whole, values in zip(aligned, (R[at], scale[at], body_pose[best], keypoints[best]), strict=True):
+        whole[known] = values
+    if not np.isfinite(aligned.scale).any():
         problem = f"have no frame with {MIN_POINTS} keypoints of a bird in two cameras"
         raise InputError(source, problem, "see `jaxfit cameras check`")
-    return R, scale, shape
+    return aligned
+
+
+def _postures(bird: Bird) -> tuple[Float[np.ndarray, "C bones 3"], Float[np.ndarray, "C K 3"], Float[np.ndarray, "C"]]:
+    """Return body poses along the first axes of the pose prior, their keypoints, and their costs in nats.
+
+    A bird with spread wings is far from the mean pose: aligned with it, the wings turn the body, and the head of the
+    fit stays in a local minimum.
+    """
+    variance, axes = np.linalg.eigh(np.asarray(bird.pose_covariance, np.float64))
+    leading = (axes * np.sqrt(np.maximum(variance, 0)))[:, ::-1][:, :POSTURE_AXES].T
+    z = np.concatenate([np.zeros((1, len(leading))), np.kron(np.eye(len(leading)), np.array([POSTURE_SDS]).T)])
+    rig, rest = fold_bird(bird), rest_pose(bird, len(z))
+    body_pose = np.asarray(rest.body_pose) + (z @ leading).reshape(rest.body_pose.shape)
+    pose = replace(rest, body_pose=jnp.asarray(body_pose, jnp.float32))
+    keypoints = window_keypoints(rig, window_transforms(rig, pose), pose)
+    return body_pose, np.asarray(keypoints, np.float64), (z**2).sum(axis=1) / 2
 
 
 def _align(
-    shape: Float[np.ndarray, "K 3"], points: Float[np.ndarray, "K 3"], weight: Float[np.ndarray, "K"]
-) -> tuple[Float[np.ndarray, "3 3"], float] | None:
-    """Return rotation and scale that align a shape with points; outliers lose weight. None for degenerate points."""
-    w = weight.copy()
-    extent = np.ptp(shape, axis=0).max()
-    R, scale = np.eye(3), 1.0
-    for _ in range(ROUNDS):
-        share = w / w.sum()
-        a, b = shape - share @ shape, points - share @ points
-        U, S, Vt = np.linalg.svd((share[:, None] * b).T @ a)
-        if S[1] < MIN_SPREAD * S[0]:
-            return None
-        D = np.array([1, 1, np.sign(np.linalg.det(U @ Vt))])
-        R = (U * D) @ Vt
-        scale = float((S * D).sum() / (share @ (a**2).sum(-1)))
-        if scale <= 0:
-            return None
-        error = np.linalg.norm(b - scale * a @ R.T, axis=-1) / (ROBUST * extent * scale)
+    shape: Float[np.ndarray, "K 3"], points: Float[np.ndarray, "M K 3"], weight: Float[np.ndarray, "M K"]
+) -> tuple[Float[np.ndarray, "M 3 3"], Float[np.ndarray, "M"], Float[np.ndarray, "M"]]:
+    """Return rotations, scales and costs that align a shape with points; outliers lose weight. NaN: points on a line.
+
+    The cost is that of Cauchy errors with the scale `ROBUST`, in nats.
+    """
+    w, extent = weight, np.ptp(shape, axis=0).max()
+    for round_ in range(ROUNDS):
+        share = w / w.sum(-1, keepdims=True)
+        a, b = shape - (share @ shape)[:, None], points - np.einsum("mk,mkc->mc", share, points)[:, None]
+        if not round_:
+            extents = np.linalg.svd(np.sqrt(share)[..., None] * b, compute_uv=False)
+            line = extents[:, 1] < MIN_SPREAD * extents[:, 0]
+        U, S, Vt = np.linalg.svd(np.einsum("mk,mkc,mkd->mcd", share, b, a))
+        D = np.ones_like(S)
+        D[:, 2] = np.sign(np.linalg.det(U @ Vt))
+        R = (U * D[:, None]) @ Vt
+        scale = (S * D).sum(-1) / np.einsum("mk,mkc->m", share, a**2)
+        error = np.linalg.norm(b - scale[:, None, None] * a @ R.swapaxes(1, 2), axis=-1)
+        error = error / np.maximum(ROBUST * extent * scale, 1e-12)[:, None]
         w = weight / (1 + error**2) ** 2
-    return R, scale
+    cost = (weight * np.log1p(error**2)).sum(-1)
+    R[line], scale[line] = np.nan, np.nan
+    return R, scale, cost
 
 
 def view_windows(

@@ -6,8 +6,10 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.files import read_cameras, write_cameras
 from jaxfit.cli.main import main
@@ -24,6 +26,7 @@ from jaxfit.fitting.views import fit_views, initial_poses, views_config, with_un
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import rest_length
 from jaxfit.model.files import load_murre, save_bird
+from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints, rest_pose
 from jaxfit.review.correct import read_tracks
 from jaxfit.simulation.rig import stage_rig
 from jaxfit.video.reader import VideoInfo
@@ -231,6 +234,40 @@ def test_initial_poses_align_the_bird_with_triangulated_keypoints(rig, views, tr
     nothing = np.zeros(both.shape)
     with pytest.raises(InputError, match="have no frame with 4 keypoints"):
         initial_poses(BIRD, points, nothing, "truth")
+
+
+def random_turns(count, seed=4):
+    return Rotation.random(count, random_state=seed).as_matrix()
+
+
+@pytest.mark.parametrize("z", [-3, 0, 2.5])
+def test_birds_with_spread_wings_start_from_spread_wings(z):
+    """Bodies along the third axis of the pose prior, the spread of the wings, in any orientation."""
+    variance, axes = np.linalg.eigh(np.asarray(BIRD.pose_covariance, float))
+    rig, rest = fold_bird(BIRD), rest_pose(BIRD)
+    turned = z * np.sqrt(variance[-3]) * axes[:, -3].reshape(rest.body_pose.shape)
+    pose = replace(rest, body_pose=jnp.asarray(rest.body_pose + turned, jnp.float32))
+    shape = np.asarray(posed_keypoints(rig, joint_transforms(rig, pose), pose), float)
+    R = random_turns(5)
+    points = 1.1 * shape @ R.swapaxes(1, 2) + np.array([3.0, -2, 9])
+    initial = initial_poses(BIRD, points[None], np.ones((1, 5, BIRD.num_keypoints)), "truth")
+    found = Rotation.from_rotvec(initial.global_orient[0]).as_matrix()
+    angle_deg = np.degrees(Rotation.from_matrix(found @ R.swapaxes(1, 2)).magnitude())
+    assert angle_deg.max() < 5
+    np.testing.assert_allclose(initial.scale, 1.1, rtol=0.05)  # postures have steps
+    assert np.abs(initial.body_pose[0] - pose.body_pose).max() < 0.6 * np.sqrt(variance[-3])
+
+
+def test_slender_birds_have_an_orientation():
+    """Keypoints along the back of a bird are no line; on a line, they have no orientation."""
+    R = random_turns(5)
+    thin = np.zeros((1, 5, BIRD.num_keypoints))
+    thin[..., [BIRD.keypoint_names.index(name) for name in ("bill_tip", "crown", "back", "tail_tip", "breast")]] = 1
+    rig, rest = fold_bird(BIRD), rest_pose(BIRD)
+    shape = np.asarray(posed_keypoints(rig, joint_transforms(rig, rest), rest), float)
+    initial = initial_poses(BIRD, (shape @ R.swapaxes(1, 2))[None], thin, "truth")
+    found = Rotation.from_rotvec(initial.global_orient[0]).as_matrix()
+    assert np.degrees(Rotation.from_matrix(found @ R.swapaxes(1, 2)).magnitude()).max() < 1
 
 
 def test_views_config_estimates_depth_and_size():
