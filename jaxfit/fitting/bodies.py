@@ -32,12 +32,14 @@ asymmetry: measurement, analysis, patterns* (differences between left and right 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
+from scipy.stats import chi2
 
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.data.solution import Solution
@@ -48,10 +50,16 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.posed_window import priors_of
 
+_logger = logging.getLogger(__name__)
+
 ASYMMETRY_SD = 0.01
 """Standard deviation of the difference between a left and a right bone, relative to their length."""
 LONGEST = 3.0
 """Largest length of an error, in units of the median of its window: outliers do not decide n_eff."""
+
+DIFFERENT, MIN_VARIANCE = 1e-4, 1e-3
+"""Two halves of a track disagree where one body explains their difference with a smaller probability. Directions whose
+difference has a smaller variance, in units of the prior, do not count."""
 
 
 class BodyEvidence(NamedTuple):
@@ -81,6 +89,8 @@ class Body(NamedTuple):
     """n_eff: the number of independent frames that the data of the track are worth."""
     determined: float
     """Number of determined numbers, P − tr(Σ·P₀) with the precision P₀ of the prior: 0 if the body is the prior's."""
+    agree: bool = True
+    """Whether the first and the second half of the windows agree about the body; they disagree for two birds."""
 
 
 def stages_of_pass(config: FitConfig, has_bodies: bool) -> range:
@@ -139,9 +149,9 @@ def estimate_bodies(
     mean, precision, broad = _prior(bird, config, stage)
     prior = _symmetric(precision, bird, stage)
     usable = [w for w, each in enumerate(evidence) if each is not None and np.isfinite(each.precision).all()]
-    bodies = {}
-    for n in np.unique(track).tolist():
-        own = [cast(BodyEvidence, evidence[w]) for w in usable if track[w] == n]
+
+    def posterior(own: Sequence[BodyEvidence]) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return mean and covariance of the body of some windows, and n_eff."""
         information, score, frames = np.zeros_like(precision), np.zeros_like(mean), 0.0
         for each in own:
             information += each.precision - precision
@@ -153,10 +163,33 @@ def estimate_bodies(
         counted = min(1 / max(_common_share(own), 1e-9), frames) if own else 0.0
         kappa = counted / max(frames, 1.0)
         covariance = np.linalg.inv(prior + kappa * information)
-        numbers = _split(mean + covariance @ (kappa * score), bird, stage)
+        return mean + covariance @ (kappa * score), (covariance + covariance.T) / 2, counted
+
+    bodies = {}
+    for n in np.unique(track).tolist():
+        own = [cast(BodyEvidence, evidence[w]) for w in usable if track[w] == n]
+        numbers, covariance, counted = posterior(own)
         determined = len(mean) - float(np.trace(covariance @ prior))
-        bodies[n] = Body(*numbers, (covariance + covariance.T) / 2, counted, determined)
+        halves = [posterior(half) for half in (own[: len(own) // 2], own[len(own) // 2 :])]
+        agree = len(own) < 2 or _agree(halves[0][:2], halves[1][:2], prior)
+        bodies[n] = Body(*_split(numbers, bird, stage), covariance, counted, determined, agree)
     return bodies
+
+
+def _agree(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray], prior: Float[np.ndarray, "P P"]) -> bool:
+    """Return whether two means of one body, each from data of its own, differ by no more than their errors explain.
+
+    With m₁, m₂ the means, S₁, S₂ the covariances and P the precision of the prior, m₁ − m₂ has the covariance
+    S₁ + S₂ − S₁PS₂ − S₂PS₁ for one body, since Cov(mᵢ) = P⁻¹ − Sᵢ and Cov(m₁, m₂) = (P⁻¹ − S₁)P(P⁻¹ − S₂).
+    """
+    (m1, S1), (m2, S2) = a, b
+    both = S1 @ prior @ S2
+    # in units of the prior, so that directions without data, which do not differ, are recognised
+    root = np.linalg.cholesky(prior)
+    values, vectors = np.linalg.eigh(root.T @ (S1 + S2 - both - both.T) @ root)
+    known = values > MIN_VARIANCE
+    squared = ((vectors.T @ root.T @ (m1 - m2))[known] ** 2 / values[known]).sum()
+    return bool(chi2.sf(squared, max(int(known.sum()), 1)) >= DIFFERENT)
 
 
 def _prior(bird: Bird, config: FitConfig, stage: StageConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -214,8 +247,16 @@ def _common_share(evidence: Sequence[BodyEvidence]) -> float:
     return float((errors * (mean**2).sum(-1)).sum()) / total if total > 0 else 1.0
 
 
-def body_arrays(bodies: Mapping[int, Body], birds: int, bird: Bird, config: FitConfig) -> dict[str, np.ndarray]:
-    """Return the arrays of `data.solution.Bodies` by their names in ``poses.npz``, for `birds` tracks."""
+def with_bodies(
+    solution: Solution, bodies: Mapping[int, Body], bird: Bird, config: FitConfig, source: object
+) -> Solution:
+    """Return a solution with the bodies of its tracks, by their positions; report tracks whose halves disagree."""
+    birds, failures = len(solution.track_id), dict(solution.failures)
+    for n in (n for n, body in bodies.items() if not body.agree):
+        track = int(solution.track_id[n])
+        text = "the first and the second half have different bodies, as of two birds: look for a switch"
+        failures[track] = (*failures.get(track, ()), text)
+        _logger.warning("%s: track %d: %s", source, track, text)
     bones, shapes = bird.num_joints - 1, bird.num_shapes
     sizes = {"bone_length": bones, "bone_length_sd": bones, "betas": shapes, "betas_sd": shapes}
     arrays = {name: np.full((birds, size), np.nan, np.float32) for name, size in sizes.items()}
@@ -230,7 +271,7 @@ def body_arrays(bodies: Mapping[int, Body], birds: int, bird: Bird, config: FitC
             arrays[f"{name}_sd"][n] = 0
             if name in names:
                 arrays[f"{name}_sd"][n, :size], sd = sd[:size], sd[size:]
-    return {f"body_{name}": array for name, array in arrays.items()}
+    return solution.with_arrays(**{f"body_{name}": array for name, array in arrays.items()}, failures=failures)
 
 
 def bodies_of(solution: Solution, config: FitConfig) -> dict[int, Body]:

@@ -19,7 +19,7 @@ from jaxfit.data.flags import with_doubts
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import bytes_per_frame
-from jaxfit.fitting.bodies import Body, body_arrays, known_rows
+from jaxfit.fitting.bodies import Body, known_rows, with_bodies
 from jaxfit.fitting.collect import blend_seams, collect_windows
 from jaxfit.fitting.crops import square_images
 from jaxfit.fitting.diagnose import check_terms
@@ -212,7 +212,7 @@ def fit_runs(
             fitted = blend_seams(some, fitted, model)
         solution = collect_windows(observations, some, fitted, bird, model.camera, config.common_size, skipped)
         if found[r]:
-            solution = solution.with_arrays(**body_arrays(found[r], observations.num_tracks, bird, config))
+            solution = with_bodies(solution, found[r], bird, config, source)
         solutions.append(with_doubts(solution, observations, bird, progress))
     return solutions
 

@@ -28,7 +28,7 @@ from jaxfit.data.solution import WORLD, Solution
 from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
 from jaxfit.data.world import in_camera, in_world, whole_picture
 from jaxfit.fitting.batch import FittedWindow
-from jaxfit.fitting.bodies import Body, body_arrays, known_rows
+from jaxfit.fitting.bodies import Body, known_rows, with_bodies
 from jaxfit.fitting.collect import blend_seams, frame_error_bars, gather_windows, pose_shapes
 from jaxfit.fitting.error_bars import error_bar_shapes
 from jaxfit.fitting.fit import check_observations, checked_model, fit
@@ -173,7 +173,7 @@ def fit_views(
     sd_m = triangulation_sd(views.cameras, found, keypoints.confidence)
     solution = solution.with_arrays(keypoints_triangulated_m=found.points_world, keypoints_triangulated_sd_m=sd_m)
     if estimated:
-        solution = solution.with_arrays(**body_arrays(estimated, birds, bird, config))
+        solution = with_bodies(solution, estimated, bird, config, source)
     seen = ((in_camera(solution, bird, camera), own) for camera, own in zip(views.cameras, checked, strict=True))
     return with_doubts_of_views(solution, seen, bird, progress)
 

@@ -124,6 +124,27 @@ def test_errors_that_all_frames_share_count_once():
     assert frames["constant"] == pytest.approx(1)
 
 
+@pytest.mark.parametrize(("difference", "agree"), [(0.0, True), (0.3, False)])
+def test_two_birds_under_one_track(difference, agree):
+    """The data of each half have errors of their own; a bird differs from the other by 0.3 in all bones."""
+    rng, prior = np.random.default_rng(4), prior_precision()[0]
+    mean, wrong = np.asarray(BIRD.bone_mean, np.float64), 0
+    for _ in range(20):
+        own = mean + rng.multivariate_normal(np.zeros(BONES), np.linalg.inv(prior_precision()[1]))
+        windows = []
+        for half in (0, 1):
+            for _ in range(2):
+                precise = np.eye(BONES) * 2000.0
+                seen = own + half * difference + rng.standard_normal(BONES) / np.sqrt(2000.0)
+                A = precise + prior
+                errors = rng.standard_normal((50, 40, 2))
+                errors -= errors.mean(0)  # all frames count
+                windows.append(evidence(np.linalg.solve(A, precise @ seen + prior @ mean), A, errors))
+        (body,) = estimate_bodies(np.zeros(4, int), windows, BIRD, CONFIG).values()
+        wrong += body.agree != agree
+    assert wrong == 0
+
+
 def test_without_a_usable_window_the_body_is_that_of_the_model():
     nothing = BodyEvidence(np.ones(BONES), np.full((BONES, BONES), np.nan), np.zeros((8, 2)), np.zeros(8), np.zeros(8))
     bodies = estimate_bodies(np.array([0, 1]), [nothing, None], BIRD, CONFIG)
