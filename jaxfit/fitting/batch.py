@@ -139,8 +139,12 @@ def fit_batch(
     bars = body = None
     if stage.share_body:
         run = _stage_run(stage, program, rows, hyperparameters, batch, first)
-        parts = [body_evidence(program, p, take_tile(rows.pose, tile)) for p, tile in run.tiles]
-        body = run.joined(jax.tree.map(lambda *x: np.stack(x), *part) for part in parts)
+        parts = []
+        for p, tile in run.tiles:
+            evidence, reasons = body_evidence(program, p, take_tile(rows.pose, tile))
+            parts.append(jax.tree.map(lambda *x: np.stack(x), *evidence))
+            _report_reasons("a window says nothing about the body of its bird", rows, tile, reasons)
+        body = run.joined(parts)
     elif configs[0].error_bars:
         covariance, used = None, stage
         if batch.body_covariance is not None:
@@ -247,7 +251,12 @@ def _error_bars(
         of_bodies = None if body_covariance is None else take_tile(body_covariance, tile)
         bars, reasons = window_error_bars(run.program, p, take_tile(rows.pose, tile), common_size, of_bodies)
         parts.append(jax.tree.map(lambda *x: np.stack(x), *bars))
-        for row, reason in zip(tile.tolist(), reasons, strict=True):
-            if row >= 0 and reason and not rows.failure[row]:
-                _logger.warning("a window has no error bars: %s", reason)
+        _report_reasons("a window has no error bars", rows, tile, reasons)
     return run.joined(parts)
+
+
+def _report_reasons(what: str, rows: Hypotheses, tile: Int[np.ndarray, "G"], reasons: Sequence[str]) -> None:
+    """Log the reasons of the rows of a tile that did not diverge."""
+    for row, reason in zip(tile.tolist(), reasons, strict=True):
+        if row >= 0 and reason and not rows.failure[row]:
+            _logger.warning("%s: %s", what, reason)

@@ -101,8 +101,8 @@ def stages_of_pass(config: FitConfig, has_bodies: bool) -> range:
     return range(shared[0], len(config.stages)) if has_bodies else range(shared[0])
 
 
-def body_evidence(program: Program, problems: Problem, pose: Pose) -> list[BodyEvidence]:
-    """Return what each of B windows says about its body.
+def body_evidence(program: Program, problems: Problem, pose: Pose) -> tuple[list[BodyEvidence], list[str]]:
+    """Return what each of B windows says about its body, and the reason why it says nothing; empty without a reason.
 
     Args:
         program: the program of the stage that shares the body.
@@ -110,7 +110,7 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> list[BodyE
         pose: their optima.
     """
     fitted_px = np.asarray(report(program, problems, pose).keypoints_px, np.float64)
-    found = []
+    found, reasons = [], []
     for b, posterior in enumerate(window_posteriors(program, problems, pose)):
         values = [np.asarray(getattr(pose, name)[b], np.float64) for name in program.shared]
         mean = np.concatenate(values)
@@ -119,6 +119,7 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> list[BodyE
             # the inverse of the block of H⁻¹ integrates the poses and the size out; the body is its last columns
             corner = posterior.factors.corner
             precision = np.linalg.inv(corner[len(corner) - len(mean) :, len(corner) - len(mean) :])
+        reasons.append(posterior if isinstance(posterior, str) else "")
         targets = problems.targets
         seen = np.asarray(targets.confidence[b] > 0) & np.asarray(targets.present[b])[:, None]
         on = np.asarray(problems.hyperparameters.keypoints_on[b])
@@ -128,7 +129,7 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> list[BodyE
         longest = LONGEST * np.median(length[seen]) if seen.any() else 0.0
         error = error * np.minimum(1, longest / np.maximum(length, 1e-9))[..., None]
         found.append(BodyEvidence(mean, precision, error.sum(0), (error**2).sum((0, 2)), seen.sum(0).astype(float)))
-    return found
+    return found, reasons
 
 
 def estimate_bodies(

@@ -381,7 +381,7 @@ def window_blocks(
         program = program._replace(terms={name: program.terms[name] for name in names})
     frames, is_shared = pose.global_orient.shape[1], shared_columns(_row(pose, 0), program.shared)
     if 64 * PERIOD * frames * len(is_shared) ** 2 > LARGEST_BYTES:
-        return [f"windows of {frames:,} frames are too long for error bars"] * len(pose.transl)
+        return [f"windows of {frames:,} frames are too long"] * len(pose.transl)
     products = jax.tree.map(np.asarray, curvature_products(program, problems, pose))
     found: list[tuple[Blocks, Columns] | str] = []
     for b in range(len(products.change)):

@@ -258,6 +258,13 @@ def test_keypoints_that_are_off_say_nothing_about_a_body(fitted):
     np.testing.assert_allclose(moved.bodies.frames, expected.bodies.frames, rtol=0.15)  # the search sees all keypoints
 
 
+def test_windows_without_a_posterior_are_reported(fitted, monkeypatch, caplog):
+    monkeypatch.setattr("jaxfit.fitting.posterior.LARGEST_BYTES", 0)
+    solution = fit(fitted[0], BIRD, CONFIG)
+    assert caplog.text.count("a window says nothing about the body of its bird: windows of 6 frames are too long") == 4
+    np.testing.assert_array_equal(solution.bodies.bone_length, np.tile(np.asarray(BIRD.bone_mean), (2, 1)))
+
+
 def test_corrected_tracks_keep_the_body_of_their_windows(fitted):
     observed, solution = fitted
     settings, second = dataclasses.replace(CONFIG, error_bars=True), int(observed.frame_index[T])
