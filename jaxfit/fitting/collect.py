@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxfit.data.body_lengths import body_lengths
 from jaxfit.data.flags import flag_counts, flagged_ranges
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
@@ -353,7 +354,8 @@ def _keypoints(rig: Rig, camera: CropCamera, pose: Pose) -> tuple[Float[Array, "
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
     """Return the content of `summary.json`: counts; status, failures, flagged frames and loss of every track; timings;
-    the identity of the video, where it is known.
+    the identity of the video, and the lengths of the bodies relative to the model with their standard deviations, where
+    they are known.
 
     Args:
         solution: the result.
@@ -361,6 +363,13 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         seconds: duration of each part of the command.
     """
     summary = {} if solution.footage is None else {"video": solution.footage.entries()}
+    if solution.bodies is not None:
+        lengths = body_lengths(bird, solution.bodies).items()
+        summary["body_lengths"] = {
+            int(track): {name: [round(float(each.share[n]), 4), round(float(each.sd[n]), 4)] for name, each in lengths}
+            for n, track in enumerate(solution.track_id)
+            if np.isfinite(solution.bodies.frames[n])
+        }
     return summary | {
         "tracks": len(solution.track_id),
         "frames": len(solution.frame_index),
