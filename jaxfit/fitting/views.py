@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
@@ -58,6 +59,8 @@ MIN_SPREAD = 0.05
 """Smallest ratio of the second to the first extent of the triangulated keypoints: points on a line have no rotation."""
 POSTURE_AXES, POSTURE_SDS = 3, (-3.0, -1.5, 1.5, 3.0)
 """Axes of the pose prior, with the largest variance first, and standard deviations of the initial body poses."""
+POSTURE_FRAMES = 5
+"""Consecutive frames whose keypoints choose the initial body pose of the frame in their middle."""
 ROUNDS = 5
 """Rounds of reweighting of the alignment, and `ROBUST` its scale relative to the extent of the bird."""
 ROBUST = 0.08
@@ -281,7 +284,11 @@ def _alignments(
     known = (weight > 0).sum(-1) >= MIN_POINTS
     found = [_align(shape, np.nan_to_num(points[known]), weight[known]) for shape in keypoints]
     R, scale, error = (np.stack(each) for each in zip(*found, strict=True))
-    best = np.argmin(error + cost[:, None], axis=0)
+    errors = np.zeros((len(cost), *known.shape))
+    errors[:, known] = error
+    # a bird hardly changes its posture from frame to frame: some frames share the cost of one posture
+    together = POSTURE_FRAMES * uniform_filter1d(errors, POSTURE_FRAMES, axis=-1, mode="constant")[:, known]
+    best = np.argmin(together + cost[:, None], axis=0)
     at = best, np.arange(len(best))
     aligned = _Aligned(
         np.full((*known.shape, 3, 3), np.nan),
@@ -326,7 +333,7 @@ def _align(
         a, b = shape - (share @ shape)[:, None], points - np.einsum("mk,mkc->mc", share, points)[:, None]
         if not round_:
             extents = np.linalg.svd(np.sqrt(share)[..., None] * b, compute_uv=False)
-            line = extents[:, 1] < MIN_SPREAD * extents[:, 0]
+            line = extents[:, 1] <= MIN_SPREAD * extents[:, 0]
         U, S, Vt = np.linalg.svd(np.einsum("mk,mkc,mkd->mcd", share, b, a))
         D = np.ones_like(S)
         D[:, 2] = np.sign(np.linalg.det(U @ Vt))

@@ -258,6 +258,18 @@ def test_birds_with_spread_wings_start_from_spread_wings(z):
     assert np.abs(initial.body_pose[0] - pose.body_pose).max() < 0.6 * np.sqrt(variance[-3])
 
 
+def test_frames_with_unsure_keypoints_start_from_the_posture_of_their_neighbours():
+    variance, axes = np.linalg.eigh(np.asarray(BIRD.pose_covariance, float))
+    rig, rest = fold_bird(BIRD), rest_pose(BIRD)
+    spread = np.asarray(rest.body_pose - 3 * np.sqrt(variance[-3]) * axes[:, -3].reshape(rest.body_pose.shape))
+    pose = replace(rest, body_pose=jnp.asarray(spread, jnp.float32))
+    shape = np.asarray(posed_keypoints(rig, joint_transforms(rig, pose), pose), float)
+    weight = np.ones((1, 5, BIRD.num_keypoints))
+    weight[:, 2] = 0.05
+    initial = initial_poses(BIRD, np.broadcast_to(shape, (1, 5, *shape.shape)), weight, "truth")
+    np.testing.assert_allclose(initial.body_pose[0], np.broadcast_to(spread, (5, *spread.shape)), atol=1e-4)
+
+
 def test_slender_birds_have_an_orientation():
     """Keypoints along the back of a bird are no line; on a line, they have no orientation."""
     R = random_turns(5)
