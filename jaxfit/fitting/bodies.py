@@ -7,19 +7,23 @@ of the prior with the mean μ, and m the optimum. The data of the window then sa
     I = A − P,   s = (A − Q)·(m − μ),
 
 information and score about b − μ. Q is the precision of the broad prior, which A and P contain, and the optimum does
-not. The windows of a track are added, and the body is the mean of
+not. The score is s = I·(b − μ) plus noise, with the covariance N = I/κ + M of two parts that the fit does not assume:
 
-    b − μ ~ N(Σ·s, Σ),   Σ = (P + κ·ΣI)⁻¹,   s = κ·Σs.
+- Errors that agree between frames. A keypoint that lies 1 % too low in one frame lies too low in the next frame. A body
+  that all frames share takes up such errors, and free bones then make the poses worse. So n frames count as n_eff = κ·n
+  frames only, with
 
-The errors of a detector agree between frames: a keypoint that lies 1 % too low in one frame lies too low in the next
-frame. A body that all frames share takes up such errors, and free bones then make the poses worse. So n frames count as
-n_eff = κ·n frames only, with
+      1/n_eff = Σ_k n·r̄_k² / Σ_k n·(mean of r_k²),
 
-    1/n_eff = Σ_k n·r̄_k² / Σ_k n·(mean of r_k²),
+  the share of the mean over the track in the squared errors r of the keypoints, summed over keypoints. For independent
+  errors, n_eff is the number of frames; for errors that do not change, n_eff is 1. Errors longer than `LONGEST` times
+  the median length of a window are shortened to this length.
+- A posture that lasts. The pose prior counts the frames of a window as independent draws, but a bird hardly changes its
+  posture. M = A·VVᵀ·A, with the covariance VVᵀ of `sandwich.constant_deviation` for the body.
 
-the share of the mean over the track in the squared errors r of the keypoints, summed over keypoints. For independent
-errors, n_eff is the number of frames; for errors that do not change, n_eff is 1. Errors longer than
-`LONGEST` times the median length of a window are shortened to this length.
+The windows of a track are added, and the body is the mean of
+
+    b − μ ~ N(Σ·ΣI·N⁻¹s, Σ),   Σ = (P + ΣI·N⁻¹·I)⁻¹.
 
 Left and right bones differ by about 1 % (`ASYMMETRY_SD`), whatever the prior of the model says about them.
 
@@ -45,6 +49,7 @@ from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.posterior import window_posteriors
 from jaxfit.fitting.problem import Problem, Program
+from jaxfit.fitting.sandwich import constant_deviation
 from jaxfit.fitting.solve import report, shared_parameters
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose
@@ -69,6 +74,8 @@ class BodyEvidence(NamedTuple):
     """m: the optimised bone lengths and shape coefficients."""
     precision: Float[np.ndarray, "*B P P"]
     """A; NaN for a window without a posterior."""
+    posture: Float[np.ndarray, "*B P P"]
+    """M: covariance of the score from a posture that differs from the mean of the prior in the whole window."""
     error_sum: Float[np.ndarray, "*B K 2"]
     """Sum over the frames of the errors of each keypoint, crop pixels, shortened."""
     error_squares: Float[np.ndarray, "*B K"]
@@ -114,12 +121,18 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> tuple[list
     for b, posterior in enumerate(window_posteriors(program, problems, pose)):
         values = [np.asarray(getattr(pose, name)[b], np.float64) for name in program.shared]
         mean = np.concatenate(values)
-        precision = np.full((len(mean), len(mean)), np.nan)
+        precision = posture = np.full((len(mean), len(mean)), np.nan)
         if not isinstance(posterior, str):
             # the inverse of the block of H⁻¹ integrates the poses and the size out; the body is its last columns
-            corner = posterior.factors.corner
-            precision = np.linalg.inv(corner[len(corner) - len(mean) :, len(corner) - len(mean) :])
-        reasons.append(posterior if isinstance(posterior, str) else "")
+            corner, body = posterior.factors.corner, slice(len(posterior.factors.corner) - len(mean), None)
+            precision = np.linalg.inv(corner[body, body])
+            posture = np.zeros_like(precision)
+            if "pose_prior" in program.terms:
+                weight = float(problems.hyperparameters.settings["pose_prior"]["weight"][b])
+                whitener = np.asarray(program.priors.pose_whitener, np.float64)
+                present = np.asarray(problems.targets.present[b], bool)
+                of_frames = constant_deviation(posterior, whitener, 3, weight, present)
+                posture = precision @ of_frames[0, -len(corner) :, -len(corner) :][body, body] @ precision
         targets = problems.targets
         seen = np.asarray(targets.confidence[b] > 0) & np.asarray(targets.present[b])[:, None]
         on = np.asarray(problems.hyperparameters.keypoints_on[b])
@@ -128,7 +141,9 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> tuple[list
         length = np.linalg.norm(error, axis=-1)
         longest = LONGEST * np.median(length[seen]) if seen.any() else 0.0
         error = error * np.minimum(1, longest / np.maximum(length, 1e-9))[..., None]
-        found.append(BodyEvidence(mean, precision, error.sum(0), (error**2).sum((0, 2)), seen.sum(0).astype(float)))
+        counts = error.sum(0), (error**2).sum((0, 2)), seen.sum(0).astype(float)
+        found.append(BodyEvidence(mean, precision, posture, *counts))
+        reasons.append(posterior if isinstance(posterior, str) else "")
     return found, reasons
 
 
@@ -153,18 +168,20 @@ def estimate_bodies(
 
     def posterior(own: Sequence[BodyEvidence]) -> tuple[np.ndarray, np.ndarray, float]:
         """Return mean and covariance of the body of some windows, and n_eff."""
-        information, score, frames = np.zeros_like(precision), np.zeros_like(mean), 0.0
-        for each in own:
-            information += each.precision - precision
-            score += (each.precision - broad) @ (each.mean - mean)
-            frames += each.errors.max(initial=0)
-        # rounding and ridges may leave slightly negative directions, which say nothing
-        values, vectors = np.linalg.eigh((information + information.T) / 2)
-        information = (vectors * np.maximum(values, 0)) @ vectors.T
+        frames = sum(each.errors.max(initial=0) for each in own)
         counted = min(1 / max(_common_share(own), 1e-9), frames) if own else 0.0
-        kappa = counted / max(frames, 1.0)
-        covariance = np.linalg.inv(prior + kappa * information)
-        return mean + covariance @ (kappa * score), (covariance + covariance.T) / 2, counted
+        kappa, information, score = counted / max(frames, 1.0), np.zeros_like(precision), np.zeros_like(mean)
+        for each in own if kappa else ():
+            # rounding and ridges may leave slightly negative directions, which say nothing
+            values, vectors = np.linalg.eigh((each.precision + each.precision.T) / 2 - precision)
+            of_data = (vectors * np.maximum(values, 0)) @ vectors.T
+            # the noise of the score; the small part of the prior keeps directions without data finite
+            noise = of_data / kappa + each.posture + 1e-9 * precision
+            gain = np.linalg.solve(noise, of_data).T
+            information += gain @ of_data
+            score += gain @ (each.precision - broad) @ (each.mean - mean)
+        covariance = np.linalg.inv(prior + information)
+        return mean + covariance @ score, (covariance + covariance.T) / 2, counted
 
     bodies = {}
     for n in np.unique(track).tolist():

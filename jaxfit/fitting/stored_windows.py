@@ -134,8 +134,8 @@ def _evidence(arrays: Mapping[str, np.ndarray], i: int) -> BodyEvidence | None:
     packed, K = arrays["body"][i], arrays["keypoints_cam"].shape[2]
     if not len(packed):
         return None
-    P = math.isqrt(len(packed) - 4 * K)  # P + P² + 4K numbers, and P² ≤ P + P² < (P + 1)²
-    shapes = (P,), (P, P), (K, 2), (K,), (K,)
+    P = math.isqrt((len(packed) - 4 * K) // 2)  # P + 2P² + 4K numbers, and 2P² ≤ P + 2P² < 2(P + 1)²
+    shapes = (P,), (P, P), (P, P), (K, 2), (K,), (K,)
     ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
     parts = np.split(packed, ends)
     return BodyEvidence(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))

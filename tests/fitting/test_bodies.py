@@ -70,7 +70,8 @@ def fitted():
 def evidence(window_means, precision, errors):
     """Return the evidence of a window: errors (T, K, 2) of keypoints."""
     sums, squares = errors.sum(0), (errors**2).sum((0, 2))
-    return BodyEvidence(window_means, precision, sums, squares, np.full(errors.shape[1], float(len(errors))))
+    nothing = np.zeros_like(precision)
+    return BodyEvidence(window_means, precision, nothing, sums, squares, np.full(errors.shape[1], float(len(errors))))
 
 
 def prior_precision():
@@ -103,6 +104,24 @@ def test_body_is_the_posterior_of_all_windows():
         body.covariance, np.linalg.inv(stacked.T @ stacked), rtol=1e-6
     )  # the prior is in float32
     assert body.frames == 150
+
+
+def test_a_posture_that_lasts_is_noise_of_the_score():
+    """The oracle: s = I·b + n as generalised least squares, with n ~ N(0, I/κ + M)."""
+    rng, mean = np.random.default_rng(5), np.asarray(BIRD.bone_mean, np.float64)
+    prior, symmetric = prior_precision()
+    errors = rng.standard_normal((50, 8, 2)) + 1  # a part of the errors is common
+    J, y, M = rng.standard_normal((20, BONES)), rng.standard_normal(BONES), rng.standard_normal((BONES, BONES))
+    of_data, M = J.T @ J, M @ M.T
+    window = evidence(np.linalg.solve(of_data + prior, y + prior @ mean), of_data + prior, errors)
+    (body,) = estimate_bodies(np.zeros(1, int), [window._replace(posture=M)], BIRD, CONFIG).values()
+    noise = of_data * 50 / body.frames + M
+    weighted = of_data @ np.linalg.inv(noise)
+    # the posterior of a window contains the broad prior of precision 1, and its optimum does not
+    broad = weighted @ (np.linalg.solve(of_data + prior, y + prior @ mean) - mean)
+    expected = np.linalg.solve(symmetric + weighted @ of_data, weighted @ (y - of_data @ mean) - broad)
+    np.testing.assert_allclose(body.bone_length, mean + expected, rtol=1e-4)
+    assert body.frames < 20
 
 
 def test_errors_that_all_frames_share_count_once():
@@ -146,7 +165,8 @@ def test_two_birds_under_one_track(difference, agree):
 
 
 def test_without_a_usable_window_the_body_is_that_of_the_model():
-    nothing = BodyEvidence(np.ones(BONES), np.full((BONES, BONES), np.nan), np.zeros((8, 2)), np.zeros(8), np.zeros(8))
+    unknown = np.full((BONES, BONES), np.nan)
+    nothing = BodyEvidence(np.ones(BONES), unknown, unknown, np.zeros((8, 2)), np.zeros(8), np.zeros(8))
     bodies = estimate_bodies(np.array([0, 1]), [nothing, None], BIRD, CONFIG)
     for body in bodies.values():
         np.testing.assert_array_equal(body.bone_length, np.asarray(BIRD.bone_mean))
@@ -157,7 +177,8 @@ def test_without_a_usable_window_the_body_is_that_of_the_model():
 def test_fit_finds_the_bones_of_each_bird(fitted):
     _, solution = fitted
     error = np.abs(solution.bodies.bone_length - LENGTHS)
-    assert (error.mean(1) < 0.5 * np.abs(1 - LENGTHS).mean(1)).all()
+    # two short windows, whose unknown postures leave a third of the errors of the mean bird at least
+    assert (error.mean(1) < 0.7 * np.abs(1 - LENGTHS).mean(1)).all()
     assert (error < 4 * solution.bodies.bone_length_sd).all()
     # one body in all windows of a track
     assert (solution.poses.bone_length == solution.bodies.bone_length[:, None]).all()
