@@ -362,7 +362,7 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         bird: the model of the fit.
         seconds: duration of each part of the command.
     """
-    summary = {} if solution.footage is None else {"video": solution.footage.entries()}
+    summary: dict[str, Any] = {} if solution.footage is None else {"video": solution.footage.entries()}
     if solution.bodies is not None:
         lengths = body_lengths(bird, solution.bodies).items()
         summary["body_lengths"] = {
