@@ -19,7 +19,7 @@ from jaxfit.evaluation import metrics
 from jaxfit.evaluation.metrics import distances
 from jaxfit.evaluation.truth import match
 from jaxfit.foundation.errors import InputError
-from jaxfit.model.bird import Bird, rest_length
+from jaxfit.model.bird import Bird, rest_bone_lengths, rest_length
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_joints
 from jaxfit.model.rotation import axis_angle_to_matrix, geodesic_distance
 
@@ -202,9 +202,9 @@ class SpatialErrors:
         self.bones = self.mean_bones = np.full((*self.measured.shape, 1), np.nan)
         if same:
             joints = [solution.joint_names.index(name) - 1 for name in truth.joint_names[1:]]
-            true_length = _rest_bones(truth_bird) * truth.poses.bone_length[n, t].astype(np.float64)
+            true_length = rest_bone_lengths(truth_bird) * truth.poses.bone_length[n, t].astype(np.float64)
             self.bones, self.mean_bones = (
-                _bone_errors((_rest_bones(bird) * length)[..., joints], true_length)
+                _bone_errors((rest_bone_lengths(bird) * length)[..., joints], true_length)
                 for length in (solution.poses.bone_length, np.asarray(bird.bone_mean))
             )
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -236,12 +236,6 @@ class SpatialErrors:
             "bone_error": of_bones(self.bones),
             "bone_error_mean_bird": of_bones(self.mean_bones),
         }
-
-
-def _rest_bones(bird: Bird) -> Float[np.ndarray, "B"]:
-    """Return the lengths of the bones of the rest skeleton, model units."""
-    joints = np.asarray(bird.joints, np.float64)
-    return np.linalg.norm(joints[1:] - joints[np.asarray(bird.parents[1:])], axis=1)
 
 
 def _bone_errors(own: Float[np.ndarray, "*#N B"], true: Float[np.ndarray, "*N B"]) -> Float[np.ndarray, "*N B"]:

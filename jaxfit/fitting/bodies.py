@@ -237,11 +237,10 @@ def _symmetric(precision: Float[np.ndarray, "P P"], bird: Bird, stage: StageConf
     if "bone_length" not in stage.optimised:
         return precision
     result = precision.copy()
-    for left, right in bird.joint_pairs:
-        if left and right:
-            difference = np.zeros(len(precision))
-            difference[[left - 1, right - 1]] = 1, -1
-            result += np.outer(difference, difference) / ASYMMETRY_SD**2
+    for pair in bird.bone_pairs:
+        difference = np.zeros(len(precision))
+        difference[list(pair)] = 1, -1
+        result += np.outer(difference, difference) / ASYMMETRY_SD**2
     return result
 
 

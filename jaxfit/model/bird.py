@@ -81,6 +81,13 @@ class Bird(eqx.Module):
         return self.shape_basis.shape[0]
 
     @property
+    def bone_pairs(self) -> tuple[tuple[int, int], ...]:
+        """(left, right) bones that mirror each other: those that end at the joints of `joint_pairs`."""
+        return tuple(
+            (left - 1, right - 1) for left, right in self.joint_pairs if left and right
+        )  # the root has no bone
+
+    @property
     def keypoints(self) -> Float[Array, "K 3"]:
         """Rest positions of the keypoints."""
         return jnp.asarray(self.keypoint_weights) @ jnp.asarray(self.vertices)
@@ -229,6 +236,12 @@ def _shape_problems(bird: Bird, arrays: dict[str, np.ndarray]) -> Iterator[tuple
             yield field, "holds NaN or infinite numbers"
         elif field != "faces" and np.abs(array).max(initial=0) > MAX_NUMBER:
             yield field, f"holds {np.abs(array).max():.3g}, more than {MAX_NUMBER:g}"
+
+
+def rest_bone_lengths(bird: Bird) -> Float[np.ndarray, "bones"]:
+    """Return the lengths of the bones of the rest skeleton, model units."""
+    joints = np.asarray(bird.joints, np.float64)
+    return np.linalg.norm(joints[1:] - joints[np.asarray(bird.parents[1:])], axis=1)
 
 
 def rest_length(bird: Bird) -> float:

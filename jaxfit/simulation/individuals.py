@@ -6,6 +6,8 @@ not show this error.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -46,9 +48,8 @@ def draw_bones_of_prior(
         rng: source of randomness.
         spread: factor of the deviations from the mean.
     """
-    factor = np.linalg.cholesky(np.asarray(bird.bone_covariance, np.float64))
     mean = np.asarray(bird.bone_mean, np.float64)
-    share = _mirrored(bird, 1 + spread * (factor @ rng.standard_normal(len(mean))) / mean)
+    share = _mirrored(bird, draw_normal(rng, mean, bird.bone_covariance, spread) / mean)
     return (mean * np.clip(share, 0.5, 1.8)).astype(np.float32)
 
 
@@ -81,7 +82,16 @@ def draw_offsets(bird: Bird, rng: np.random.Generator, mean: float = OFFSET) -> 
 
 def _mirrored(bird: Bird, share: Float[np.ndarray, "bones"]) -> Float[np.ndarray, "bones"]:
     """Return values of the bones, with those of the left side on both sides."""
-    for left, right in bird.joint_pairs:
-        if left and right:  # the root has no bone
-            share[right - 1] = share[left - 1]
+    for left, right in bird.bone_pairs:
+        share[right] = share[left]
     return share
+
+
+def draw_normal(random: np.random.Generator, mean: Any, covariance: Any, spread: float = 1.0) -> Float[np.ndarray, "D"]:
+    """Draw from a normal distribution whose deviations are multiplied by `spread`.
+
+    `Generator.multivariate_normal` decomposes into singular vectors. A covariance with equal eigenvalues has many such
+    decompositions, and the rounding of the processor selects one. The Cholesky factor is unique.
+    """
+    factor = np.linalg.cholesky(np.asarray(covariance, np.float64))
+    return np.asarray(mean) + spread * factor @ random.standard_normal(len(factor))

@@ -115,10 +115,16 @@ def simulate_detections(
 
 def _jitter(rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "N T *rest"]:
     """Draw noise of unit variance, partly correlated between frames."""
-    correlated = rng.normal(size=shape)
-    for t in range(1, shape[1]):
-        correlated[:, t] = RHO * correlated[:, t - 1] + np.sqrt(1 - RHO**2) * correlated[:, t]
+    correlated = autoregressive(rng, shape, RHO)
     return np.sqrt(CORRELATED) * correlated + np.sqrt(1 - CORRELATED) * rng.normal(size=shape)
+
+
+def autoregressive(rng: np.random.Generator, shape: tuple[int, ...], rho: float) -> Float[np.ndarray, "N T *rest"]:
+    """Draw normal noise of unit variance, AR(1) along the second axis: z_t = ρ·z_{t−1} + √(1 − ρ²)·w_t."""
+    noise = rng.normal(size=shape)
+    for t in range(1, shape[1]):
+        noise[:, t] = rho * noise[:, t - 1] + np.sqrt(1 - rho**2) * noise[:, t]
+    return noise
 
 
 def _runs(rng: np.random.Generator, rate, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T *rest"]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from jaxfit.model.camera import CropCamera, project, to_screen
 from jaxfit.model.kinematics import Pose, fold_bird, joint_transforms, posed_vertices
 from jaxfit.model.rotation import view_grid
 from jaxfit.raster.zbuffer import hard_mask, zbuffer
+from jaxfit.simulation.individuals import draw_normal
 
 
 def random_species(bird: Bird, seed: int, bone_sd: float = 0.05) -> Bird:
@@ -28,12 +28,11 @@ def random_species(bird: Bird, seed: int, bone_sd: float = 0.05) -> Bird:
     """
     random = np.random.default_rng(seed)
     betas = random.standard_normal(bird.num_shapes) * np.sqrt(np.asarray(bird.shape_variance))
-    bones = _normal(random, bird.bone_mean, bird.bone_covariance)
+    bones = draw_normal(random, bird.bone_mean, bird.bone_covariance)
     factor = np.exp(bone_sd * random.standard_normal(len(bones)))
-    for left, right in bird.joint_pairs:
-        if left and right:
-            bones[[left - 1, right - 1]] = bones[[left - 1, right - 1]].mean()
-            factor[right - 1] = factor[left - 1]
+    for left, right in bird.bone_pairs:
+        bones[[left, right]] = bones[[left, right]].mean()
+        factor[right] = factor[left]
     bones = np.clip(bones, 0.5, 1.8) * factor
     shift = np.tensordot(betas, np.asarray(bird.shape_basis), axes=1)
     return replace(
@@ -46,7 +45,7 @@ def random_species(bird: Bird, seed: int, bone_sd: float = 0.05) -> Bird:
 
 def random_pose(bird: Bird, random: np.random.Generator, spread: float = 0.7) -> Pose:
     """Return a pose from the prior of a model, with its deviations times `spread`, and the mean bones and shape."""
-    body = _normal(random, bird.pose_mean, bird.pose_covariance, spread)
+    body = draw_normal(random, bird.pose_mean, bird.pose_covariance, spread)
     return Pose(
         global_orient=np.zeros(3, np.float32),
         body_pose=body.reshape(-1, 3).astype(np.float32),
@@ -55,16 +54,6 @@ def random_pose(bird: Bird, random: np.random.Generator, spread: float = 0.7) ->
         bone_length=np.asarray(bird.bone_mean, np.float32),
         betas=np.zeros(bird.num_shapes, np.float32),
     )
-
-
-def _normal(random: np.random.Generator, mean: Any, covariance: Any, spread: float = 1.0) -> Float[np.ndarray, "D"]:
-    """Draw from a normal distribution whose deviations are multiplied by `spread`.
-
-    `Generator.multivariate_normal` decomposes into singular vectors. A covariance with equal eigenvalues has many such
-    decompositions, and the rounding of the processor selects one. The Cholesky factor is unique.
-    """
-    factor = np.linalg.cholesky(np.asarray(covariance, np.float64))
-    return np.asarray(mean) + spread * factor @ random.standard_normal(len(factor))
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,7 @@ from jaxfit.perception.track import track_video
 from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.individuals import draw_bones, draw_bones_of_prior, draw_offsets, draw_shape
-from jaxfit.simulation.noise import detect
+from jaxfit.simulation.noise import autoregressive, detect
 from jaxfit.simulation.rig import stage_rig
 from jaxfit.simulation.scene import simulate, stage_scene
 from jaxfit.simulation.species import random_pose, random_species
@@ -385,9 +385,7 @@ def _heavy_errors(rng: np.random.Generator, exact: Observations) -> Observations
     """
     N, T, K = exact.confidence.shape
     sd = np.exp(rng.uniform(np.log(0.7), np.log(3.0), (N, 1, K)))
-    normal = rng.standard_normal((N, T, K, 2))
-    for t in range(1, T):
-        normal[:, t] = RHO * normal[:, t - 1] + np.sqrt(1 - RHO**2) * normal[:, t]
+    normal = autoregressive(rng, (N, T, K, 2), RHO)
     error = sd[..., None] * normal / np.sqrt(rng.chisquare(DOF, (N, T, K, 1)) / DOF)
     runs = np.repeat(rng.random((N, -(-T // 10), K)), 10, axis=1)[:, :T]
     ratio = np.linalg.norm(error, axis=-1) / 3.0
@@ -409,9 +407,7 @@ def _correlated_errors(rng: np.random.Generator, exact: Observations) -> Observa
     confidences are 1.
     """
     points = exact.keypoints_px.astype(np.float64)
-    z = rng.standard_normal(points.shape)
-    for t in range(1, points.shape[1]):
-        z[:, t] = AR1 * z[:, t - 1] + np.sqrt(1 - AR1**2) * z[:, t]
+    z = autoregressive(rng, points.shape, AR1)
     moved = np.linalg.norm(np.diff(points, axis=1, append=points[:, -1:]), axis=-1, keepdims=True)
     error = np.hypot(ERROR_PX, MOTION * moved) * z
     is_outlier = rng.random(exact.confidence.shape) < OUTLIERS

@@ -20,7 +20,7 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 
 from jaxfit.foundation.extras import own_version
-from jaxfit.model.bird import Bird, model_hash
+from jaxfit.model.bird import Bird, model_hash, rest_bone_lengths
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_keypoints, posed_vertices, rest_pose
 
 BONE_SD = 0.05
@@ -36,7 +36,7 @@ def body_length(bird: Bird) -> float:
 def symmetric_bones(bird: Bird) -> Float[np.ndarray, "bones Q"]:
     """Return the matrix from Q lengths to all bones, which gives the left and the right bone of a pair one length."""
     bones = bird.num_joints - 1
-    right_of = {left - 1: right - 1 for left, right in bird.joint_pairs if left and right}
+    right_of = dict(bird.bone_pairs)
     right = set(right_of.values())
     columns = []
     for bone in range(bones):
@@ -65,9 +65,7 @@ def absolute_bones(bird: Bird, bone_length: Any = None) -> Float[np.ndarray, "bo
         bird: the model.
         bone_length: relative to the rest skeleton; None for the mean of the prior.
     """
-    joints, parents = np.asarray(bird.joints, np.float64), np.array(bird.parents)
-    rest = np.linalg.norm(joints[1:] - joints[parents[1:]], axis=1)
-    return rest * np.asarray(bird.bone_mean if bone_length is None else bone_length, np.float64)
+    return rest_bone_lengths(bird) * np.asarray(bird.bone_mean if bone_length is None else bone_length, np.float64)
 
 
 def rest_surface(bird: Bird) -> Float[np.ndarray, "V 3"]:
