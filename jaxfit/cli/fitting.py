@@ -99,7 +99,7 @@ def _known_bodies(
 
     if options.body is None:
         return None
-    if not any(stage.share_body for stage in config.stages):
+    if config.body_stage is None:
         problem = "has no stage that uses the body of a bird"
         raise InputError(f"config {options.config}", problem, "choose a config with `share_body`, such as `map`")
     solution, own = load_solution(options.body)
@@ -109,7 +109,7 @@ def _known_bodies(
         raise InputError(options.body, f"has the bodies of another model, {own.name}", "give a result of this model")
     bodies = bodies_of(solution, config)
     has_shapes = any(body.betas.any() for body in bodies.values())
-    if has_shapes and not any(stage.share_body and "betas" in stage.optimised for stage in config.stages):
+    if has_shapes and "betas" not in config.stages[config.body_stage].optimised:
         problem = "has bodies with a shape, but no stage of the config shares the shape"
         raise InputError(options.body, problem, "choose a config that shares `betas`, such as `map`")
     if not bodies.keys() & set(tracks):

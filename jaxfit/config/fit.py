@@ -240,6 +240,11 @@ class FitConfig:
         """Number of frames that consecutive windows share: `overlap`, or half of a shorter window."""
         return min(self.overlap, self.window // 2)
 
+    @property
+    def body_stage(self) -> int | None:
+        """Position of the stage with `share_body`; None without such a stage."""
+        return next((i for i, stage in enumerate(self.stages) if stage.share_body), None)
+
     def stage_settings(self, stage: StageConfig) -> dict[str, dict[str, float]]:
         """Return the weight and settings of each term of a stage: defaults, `terms`, then the stage's `override`."""
         settings = {}

@@ -41,16 +41,16 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from jaxfit.config.fit import FitConfig, StageConfig
+from jaxfit.config.fit import FitConfig
 from jaxfit.data.solution import Solution
-from jaxfit.fitting.posterior import window_posteriors
+from jaxfit.fitting.posterior import BROAD_BONE_SD, BROAD_SHAPE_SD, window_posteriors
 from jaxfit.fitting.problem import Problem, Program
 from jaxfit.fitting.sandwich import constant_deviation
-from jaxfit.fitting.solve import report, shared_parameters
+from jaxfit.fitting.solve import shared_parameters
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.posed_window import priors_of
@@ -102,21 +102,29 @@ class Body(NamedTuple):
 
 def stages_of_pass(config: FitConfig, has_bodies: bool) -> range:
     """Return the positions of the stages before the bodies are known, or with given bodies."""
-    shared = [i + 1 for i, stage in enumerate(config.stages) if stage.share_body]
-    if not shared:
+    if config.body_stage is None:
         return range(len(config.stages))
-    return range(shared[0], len(config.stages)) if has_bodies else range(shared[0])
+    after = config.body_stage + 1
+    return range(after, len(config.stages)) if has_bodies else range(after)
 
 
-def body_evidence(program: Program, problems: Problem, pose: Pose) -> tuple[list[BodyEvidence], list[str]]:
+def _body_numbers(config: FitConfig) -> tuple[str, ...]:
+    """Return the parameters of a body that the config estimates, in their order; none without `share_body`."""
+    return () if config.body_stage is None else shared_parameters(config.stages[config.body_stage])
+
+
+def body_evidence(
+    program: Program, problems: Problem, pose: Pose, keypoints_px: Float[Array, "B T K 2"]
+) -> tuple[list[BodyEvidence], list[str]]:
     """Return what each of B windows says about its body, and the reason why it says nothing; empty without a reason.
 
     Args:
         program: the program of the stage that shares the body.
         problems: B problems.
         pose: their optima.
+        keypoints_px: the keypoints of these poses, crop pixels.
     """
-    fitted_px = np.asarray(report(program, problems, pose).keypoints_px, np.float64)
+    fitted_px = np.asarray(keypoints_px, np.float64)
     found, reasons = [], []
     for b, posterior in enumerate(window_posteriors(program, problems, pose)):
         values = [np.asarray(getattr(pose, name)[b], np.float64) for name in program.shared]
@@ -124,15 +132,14 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> tuple[list
         precision = posture = np.full((len(mean), len(mean)), np.nan)
         if not isinstance(posterior, str):
             # the inverse of the block of H⁻¹ integrates the poses and the size out; the body is its last columns
-            corner, body = posterior.factors.corner, slice(len(posterior.factors.corner) - len(mean), None)
-            precision = np.linalg.inv(corner[body, body])
+            precision = np.linalg.inv(_last_block(posterior.factors.corner, len(mean)))
             posture = np.zeros_like(precision)
             if "pose_prior" in program.terms:
                 weight = float(problems.hyperparameters.settings["pose_prior"]["weight"][b])
                 whitener = np.asarray(program.priors.pose_whitener, np.float64)
                 present = np.asarray(problems.targets.present[b], bool)
                 of_frames = constant_deviation(posterior, whitener, 3, weight, present)
-                posture = precision @ of_frames[0, -len(corner) :, -len(corner) :][body, body] @ precision
+                posture = precision @ _last_block(of_frames[0], len(mean)) @ precision
         targets = problems.targets
         seen = np.asarray(targets.confidence[b] > 0) & np.asarray(targets.present[b])[:, None]
         on = np.asarray(problems.hyperparameters.keypoints_on[b])
@@ -145,6 +152,12 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> tuple[list
         found.append(BodyEvidence(mean, precision, posture, *counts))
         reasons.append(posterior if isinstance(posterior, str) else "")
     return found, reasons
+
+
+def _last_block(matrix: Float[np.ndarray, "n n"], size: int) -> Float[np.ndarray, "size size"]:
+    """Return the block of the last rows and columns; their number may be 0."""
+    first = len(matrix) - size
+    return matrix[first:, first:]
 
 
 def estimate_bodies(
@@ -161,9 +174,9 @@ def estimate_bodies(
         bird: the model.
         config: the config, whose shared stage has the weights of the priors.
     """
-    stage = config.stages[stages_of_pass(config, has_bodies=False)[-1]]
-    mean, precision, broad = _prior(bird, config, stage)
-    prior = _symmetric(precision, bird, stage)
+    names = _body_numbers(config)
+    mean, precision, broad = _prior(bird, config)
+    prior = _symmetric(precision, bird) if "bone_length" in names else precision
     usable = [w for w, each in enumerate(evidence) if each is not None and np.isfinite(each.precision).all()]
 
     def posterior(own: Sequence[BodyEvidence]) -> tuple[np.ndarray, np.ndarray, float]:
@@ -188,9 +201,10 @@ def estimate_bodies(
         own = [cast(BodyEvidence, evidence[w]) for w in usable if track[w] == n]
         numbers, covariance, counted = posterior(own)
         determined = len(mean) - float(np.trace(covariance @ prior))
-        halves = [posterior(half) for half in (own[: len(own) // 2], own[len(own) // 2 :])]
-        agree = len(own) < 2 or _agree(halves[0][:2], halves[1][:2], prior)
-        bodies[n] = Body(*_split(numbers, bird, stage), covariance, counted, determined, agree)
+        half = len(own) // 2
+        agree = not half or _agree(posterior(own[:half])[:2], posterior(own[half:])[:2], prior)
+        of_model = np.asarray(bird.bone_mean, np.float32), np.zeros(bird.num_shapes, np.float32)
+        bodies[n] = Body(*_split(numbers, names, *of_model), covariance, counted, determined, agree)
     return bodies
 
 
@@ -210,32 +224,31 @@ def _agree(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray], p
     return bool(chi2.sf(squared, max(int(known.sum()), 1)) >= DIFFERENT)
 
 
-def _prior(bird: Bird, config: FitConfig, stage: StageConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return mean and precision of the prior of the numbers that the stage optimises, and the part of the broad prior.
+def _prior(bird: Bird, config: FitConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mean and precision of the prior of the numbers of a body, and the part of the broad prior.
 
     The posterior of a window contains the broad prior (`posterior.broad_precision`), but the fit does not.
     """
-    settings, priors = config.stage_settings(stage), priors_of(bird)
+    settings = config.stage_settings(config.stages[stages_of_pass(config, has_bodies=False)[-1]])
+    priors = priors_of(bird)
     whitener, shape_sd = (np.asarray(each, np.float64) for each in (priors.bone_whitener, priors.shape_sd))
     # a term w·‖W(b − μ)‖² in nats has the precision 2w·WᵀW
     of = {
-        "bone_length": (priors.bone_mean, "bone_prior", whitener.T @ whitener, 1.0),
-        "betas": (np.zeros(len(shape_sd)), "shape_prior", np.diag(shape_sd**-2), 0.01),
+        "bone_length": (priors.bone_mean, "bone_prior", whitener.T @ whitener, BROAD_BONE_SD),
+        "betas": (np.zeros(len(shape_sd)), "shape_prior", np.diag(shape_sd**-2), BROAD_SHAPE_SD),
     }
     means, blocks, broad_blocks = [], [], []
-    for name in shared_parameters(stage):
-        mean, term, precision, broad = of[name]
+    for name in _body_numbers(config):
+        mean, term, precision, broad_sd = of[name]
         means.append(np.asarray(mean, np.float64))
         weight = settings.get(term, {}).get("weight", 0.0)
-        broad_blocks.append(broad * np.eye(len(precision)))
+        broad_blocks.append(broad_sd**-2 * np.eye(len(precision)))
         blocks.append(2 * weight * precision + broad_blocks[-1])
     return np.concatenate(means), np.asarray(block_diag(*blocks)), np.asarray(block_diag(*broad_blocks))
 
 
-def _symmetric(precision: Float[np.ndarray, "P P"], bird: Bird, stage: StageConfig) -> Float[np.ndarray, "P P"]:
-    """Return the precision of the prior with the small differences between left and right bones."""
-    if "bone_length" not in stage.optimised:
-        return precision
+def _symmetric(precision: Float[np.ndarray, "P P"], bird: Bird) -> Float[np.ndarray, "P P"]:
+    """Return the precision of a prior, bones first, with the small differences between left and right bones."""
     result = precision.copy()
     for pair in bird.bone_pairs:
         difference = np.zeros(len(precision))
@@ -244,16 +257,19 @@ def _symmetric(precision: Float[np.ndarray, "P P"], bird: Bird, stage: StageConf
     return result
 
 
-def _split(body: Float[np.ndarray, "P"], bird: Bird, stage: StageConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return bone lengths and shape coefficients; those that the stage does not optimise are the mean of the model."""
-    bones: np.ndarray = np.array(bird.bone_mean, np.float32)
-    shapes = np.zeros(bird.num_shapes, np.float32)
-    names = shared_parameters(stage)
+def _split(
+    numbers: Float[np.ndarray, "P"], names: Sequence[str], bone_length: np.ndarray, betas: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bone lengths and the shape coefficients among the numbers of a body, float32.
+
+    Args:
+        numbers: the numbers of a body.
+        names: the parameters that the body has.
+        bone_length, betas: values in place of a parameter that the body does not have.
+    """
     if "bone_length" in names:
-        bones = body[: len(bones)].astype(np.float32)
-    if "betas" in names:
-        shapes = body[-len(shapes) or len(body) :].astype(np.float32)
-    return bones, shapes
+        bone_length, numbers = numbers[: len(bone_length)], numbers[len(bone_length) :]
+    return np.asarray(bone_length, np.float32), np.asarray(numbers if "betas" in names else betas, np.float32)
 
 
 def _common_share(evidence: Sequence[BodyEvidence]) -> float:
@@ -278,16 +294,12 @@ def with_bodies(
     sizes = {"bone_length": bones, "bone_length_sd": bones, "betas": shapes, "betas_sd": shapes}
     arrays = {name: np.full((birds, size), np.nan, np.float32) for name, size in sizes.items()}
     arrays |= {name: np.full(birds, np.nan, np.float32) for name in ("frames", "determined")}
-    names = shared_parameters(config.stages[stages_of_pass(config, has_bodies=False)[-1]])
     for n, body in bodies.items():
         arrays["bone_length"][n], arrays["betas"][n, : len(body.betas)] = body.bone_length, body.betas
         arrays["betas"][n, len(body.betas) :] = 0  # for a fit without shape coefficients
         arrays["frames"][n], arrays["determined"][n] = body.frames, body.determined
-        sd = np.sqrt(np.diagonal(body.covariance))
-        for name, size in (("bone_length", bones), ("betas", len(body.betas))):
-            arrays[f"{name}_sd"][n] = 0
-            if name in names:
-                arrays[f"{name}_sd"][n, :size], sd = sd[:size], sd[size:]
+        sd = _split(np.sqrt(np.diagonal(body.covariance)), _body_numbers(config), np.zeros(bones), np.zeros(shapes))
+        arrays["bone_length_sd"][n], arrays["betas_sd"][n] = sd
     return solution.with_arrays(**{f"body_{name}": array for name, array in arrays.items()}, failures=failures)
 
 
@@ -296,10 +308,9 @@ def bodies_of(solution: Solution, config: FitConfig) -> dict[int, Body]:
 
     The covariances of a result are diagonal: it holds standard deviations.
     """
-    known, stages = solution.bodies, [stage for stage in config.stages if stage.share_body]
-    if known is None or not stages:
+    known, names, found = solution.bodies, _body_numbers(config), {}
+    if known is None or not names:
         return {}
-    names, found = shared_parameters(stages[0]), {}
     for n in np.flatnonzero(np.isfinite(known.frames)).tolist():
         sd = np.concatenate([getattr(known, f"{name}_sd")[n] for name in names]).astype(np.float64)
         numbers = known.bone_length[n], known.betas[n]

@@ -51,6 +51,8 @@ TOLERANCE = 1e-4
 farther apart."""
 RIDGES = 1e-6, 1e-5, 1e-4, 1e-3
 """Fractions of the diagonal that are added to H, until its factorisation exists. Products are in float32."""
+BROAD_BONE_SD, BROAD_SHAPE_SD = 1.0, 10.0
+"""Standard deviations of bone lengths and of shape coefficients in the broad prior."""
 LARGEST_BYTES = 3e9
 """Memory of the blocks of a window, above which a window has no posterior."""
 
@@ -334,8 +336,9 @@ def broad_precision(program: Program, pose: Pose, px_per_unit: float | None = No
     """Return the precision of a prior so broad that it matters only without data, in the columns of `frame_rows`.
 
     Standard deviations: π/√3 rad for the components of an axis-angle (uniform within ±π), the uniform distribution over
-    the crop for x and y, the distance of the bird for z, the size of the bird for its scale, 1 for bone lengths, 10 for
-    shape coefficients. The prior keeps directions without data finite: no matrix is singular.
+    the crop for x and y, the distance of the bird for z, the size of the bird for its scale, `BROAD_BONE_SD` for bone
+    lengths, `BROAD_SHAPE_SD` for shape coefficients. The prior keeps directions without data finite: no matrix is
+    singular.
 
     Args:
         program: the program.
@@ -353,8 +356,8 @@ def broad_precision(program: Program, pose: Pose, px_per_unit: float | None = No
         body_pose=np.full(np.shape(pose.body_pose), np.pi / np.sqrt(3)),
         transl=np.concatenate([crop / np.sqrt(12)] * 2 + [depth], axis=1),
         scale=np.abs(np.asarray(pose.scale)),
-        bone_length=np.ones(np.shape(pose.bone_length)),
-        betas=np.full(np.shape(pose.betas), 10.0),
+        bone_length=np.full(np.shape(pose.bone_length), BROAD_BONE_SD),
+        betas=np.full(np.shape(pose.betas), BROAD_SHAPE_SD),
     )
     return np.maximum(np.asarray(frame_rows(sd, program.shared), np.float64), 1e-6) ** -2
 

@@ -235,8 +235,7 @@ def fit_windows(
         return _fit_pass(task, model, birds, subject, progress, stored, cluster)
 
     windows = run(task, subject)
-    shares = any(stage.share_body for stage in task.configs[0].stages)
-    if not shares:
+    if task.configs[0].body_stage is None:
         return Fitted(windows, [{} for _ in task.configs])
     bodies, starts = [], {}
     for r, (config, of_run) in enumerate(zip(task.configs, task.windows, strict=True)):

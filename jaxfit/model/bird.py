@@ -83,9 +83,8 @@ class Bird(eqx.Module):
     @property
     def bone_pairs(self) -> tuple[tuple[int, int], ...]:
         """(left, right) bones that mirror each other: those that end at the joints of `joint_pairs`."""
-        return tuple(
-            (left - 1, right - 1) for left, right in self.joint_pairs if left and right
-        )  # the root has no bone
+        # no bone ends at the root
+        return tuple((left - 1, right - 1) for left, right in self.joint_pairs if left and right)
 
     @property
     def keypoints(self) -> Float[Array, "K 3"]:

@@ -87,11 +87,11 @@ def _mirrored(bird: Bird, share: Float[np.ndarray, "bones"]) -> Float[np.ndarray
     return share
 
 
-def draw_normal(random: np.random.Generator, mean: Any, covariance: Any, spread: float = 1.0) -> Float[np.ndarray, "D"]:
+def draw_normal(rng: np.random.Generator, mean: Any, covariance: Any, spread: float = 1.0) -> Float[np.ndarray, "D"]:
     """Draw from a normal distribution whose deviations are multiplied by `spread`.
 
     `Generator.multivariate_normal` decomposes into singular vectors. A covariance with equal eigenvalues has many such
     decompositions, and the rounding of the processor selects one. The Cholesky factor is unique.
     """
     factor = np.linalg.cholesky(np.asarray(covariance, np.float64))
-    return np.asarray(mean) + spread * factor @ random.standard_normal(len(factor))
+    return np.asarray(mean) + spread * factor @ rng.standard_normal(len(factor))
