@@ -209,6 +209,7 @@ LAYOUT: dict[str, tuple[str, Any]] = {
 """The arrays of every ``poses.npz``."""
 ERROR_BARS, WORLD, TRIANGULATED, BODIES = (_group_layout(name) for name in _OPTIONAL)
 LEDGE = {"contact": ("N T", np.float32)}
+OPTIONAL = ERROR_BARS | WORLD | TRIANGULATED | BODIES | LEDGE
 """The arrays that a ``poses.npz`` may have."""
 
 
@@ -387,7 +388,7 @@ def _typed(values: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: an array has another type or shape.
     """
-    layout = LAYOUT | ERROR_BARS | WORLD | TRIANGULATED | BODIES | LEDGE
+    layout = LAYOUT | OPTIONAL
     arrays: dict[str, Any] = validate_arrays(values, {name: layout[name] for name in layout if name in values})
     arrays |= {name: tuple(arrays[name].tolist()) for name in _NAMES if name in arrays}
     numbers = {"focal_px": float, "crop_px": int}
@@ -549,9 +550,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     folder = check_folder(folder, "a folder of results", _WRITTEN_BY)
     path = check_readable(folder / POSES, "an .npz file", _WRITTEN_BY)
     shapes = {name: shape for name, (shape, _) in LAYOUT.items()} | {"loss": "N L", "loss_terms": "L"}
-    optional = {
-        name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | TRIANGULATED | BODIES | LEDGE).items()
-    }
+    optional = {name: shape for name, (shape, _) in (_TIMES | OPTIONAL).items()}
     optional |= {name: shapes.pop(name) for name in ("ambiguity_deg", "doubts")}
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
     terms, loss = arrays.pop("loss_terms"), arrays.pop("loss")
