@@ -3,13 +3,13 @@
 import dataclasses
 
 import numpy as np
-from support.birds import tiny_bird
+from support.birds import toy_bird
 
 from jaxfit.data.body_lengths import body_lengths
 from jaxfit.data.solution import Bodies
 from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints, rest_pose
 
-BIRD = tiny_bird()
+BIRD = toy_bird(subdivisions=0)  # its head follows two bones
 BONES, SHAPES = BIRD.num_joints - 1, BIRD.num_shapes
 
 
@@ -36,7 +36,7 @@ def test_lengths_are_those_of_the_posed_bird():
     of_model = posed_length(np.asarray(BIRD.bone_mean), np.zeros(SHAPES, np.float32))
     expected = [posed_length(*body) / of_model for body in zip(bones, betas, strict=True)]
     np.testing.assert_allclose(found["length"].share, expected, rtol=1e-5)
-    assert "wing" not in found  # the tiny bird has no shoulder
+    assert "wing" not in found  # this bird has no shoulder
 
 
 def test_standard_deviations_are_those_of_draws():
