@@ -470,3 +470,23 @@ def test_times_are_rounded_before_they_are_divided():
         "1:00:00 h",
     ]
     assert clock(59.96, digits=1) == "1:00.0"
+
+
+def test_bodies_are_a_column_in_per_cent_of_the_model(folder):
+    """The second body is not determined, and the third bird has none."""
+    made, bird = load_solution(folder)
+    bones, shapes, birds = bird.num_joints - 1, bird.num_shapes, len(made.track_id)
+    assert birds == 3
+    arrays = {"bone_length": np.ones((birds, bones)), "bone_length_sd": np.full((birds, bones), 0.01)}
+    arrays |= {"betas": np.zeros((birds, shapes)), "betas_sd": np.zeros((birds, shapes))}
+    arrays |= {"frames": np.array([5, 5, np.nan]), "determined": np.array([3.0, 0.5, np.nan])}
+    made = made.with_arrays(**{f"body_{name}": np.float32(values) for name, values in arrays.items()})
+    root = parsed(page(gather(made, None, {}, "", folder, bird), []))
+    table = rows_of(section(root, "Quality of each track"))
+    names, headings = ("length", "head and bill"), next(iter(table.values()))
+    assert headings[-1] == f"Body{' / '.join(names)}, % of the model"  # name and unit of the column
+    cells = [table[str(track)][-1] for track in made.track_id.tolist()]
+    assert re.fullmatch(r"100 ± \d / 100 ± \d", cells[0])
+    assert cells[1:] == ["as the model", "–"]
+    without = parsed(page(gather(load_solution(folder)[0], None, {}, "", folder, bird), []))
+    assert "Body" not in text_of(section(without, "Quality of each track"))

@@ -53,8 +53,8 @@ class Track:
     expected_error: Float[np.ndarray, "T"]
     """RMS error of the keypoints that the error bars expect, as a share of the length of the bird
     (`jaxfit.data.flags.expected_error`); NaN without a pose or without error bars."""
-    body: str | None = None
-    """Lengths of the bird, in per cent of the model; None for a result without bodies."""
+    body: str
+    """`Report.body_lengths` of the bird in per cent of the model, with their standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,8 @@ class Report:
     corrections: tuple[str, ...]
     config: str
     """The config as YAML."""
+    body_lengths: tuple[str, ...]
+    """Names of the lengths of the bodies (`jaxfit.data.body_lengths`); empty for a result without bodies."""
 
     @property
     def has_detections(self) -> bool:
@@ -171,7 +173,8 @@ def gather(
         problem = f"has an entry that jaxfit does not write: {error}"
         raise InputError(folder / SUMMARY, problem, "run the reconstruction again") from error
     video = entries["video"]
-    tracks = _tracks(solution, observations, problems, expected, bird)
+    lengths = {} if solution.bodies is None or bird is None else body_lengths(bird, solution.bodies)
+    tracks = _tracks(solution, observations, problems, expected, lengths)
     return Report(
         folder=str(folder),
         title=Path(video).name or video if video else folder.name,
@@ -182,6 +185,7 @@ def gather(
         fps=solution.fps,
         tracks=tuple(sorted(tracks, key=lambda track: (np.append(track.present, True).argmax(), track.position))),
         config=config,
+        body_lengths=tuple(lengths),
         **entries,
     )
 
@@ -220,7 +224,7 @@ def _tracks(
     observations: Observations | None,
     problems: Mapping[str, tuple[str, ...]],
     expected: Float[np.ndarray, "N T"],
-    bird: Bird | None,
+    lengths: Mapping[str, BodyLength],
 ) -> list[Track]:
     means = mean_confidence(observations.confidence) if observations and observations.num_keypoints else None
     quality = {} if observations is None else {row.track_id: row for row in track_quality(observations)}
@@ -228,8 +232,6 @@ def _tracks(
     size = _image_size(solution)
     total = np.sum(list(solution.loss.values()), axis=0) if solution.loss else np.full(len(solution.track_id), np.nan)
     found, flagged = flags(np.asarray(solution.flags.doubts)), flagged_ranges(solution)
-    bodies = solution.bodies
-    lengths = {} if bodies is None or bird is None else body_lengths(bird, bodies)
     tracks = []
     for n, track_id in enumerate(solution.track_id.tolist()):
         valid, present, confidence = solution.valid[n], solution.valid[n], None
@@ -255,20 +257,19 @@ def _tracks(
                 flags=found[n],
                 flagged=flagged.get(track_id, ()),
                 expected_error=expected[n],
-                body=_body(bodies, lengths, n) if bodies is not None and lengths else None,
+                body=_body(solution.bodies, lengths, n),
             )
         )
     return tracks
 
 
-def _body(bodies: Bodies, lengths: Mapping[str, BodyLength], n: int) -> str:
+def _body(bodies: Bodies | None, lengths: Mapping[str, BodyLength], n: int) -> str:
     """Return the lengths of a bird as text, in per cent of the model."""
-    if not np.isfinite(bodies.frames[n]):
+    if bodies is None or not np.isfinite(bodies.frames[n]):
         return "–"
     if bodies.determined[n] < 1:
         return "as the model"
-    rows = (f"{name} {100 * each.share[n]:.0f} ± {100 * each.sd[n]:.0f}" for name, each in lengths.items())
-    return ", ".join(rows)
+    return " / ".join(f"{100 * each.share[n]:.0f} ± {100 * each.sd[n]:.0f}" for each in lengths.values())
 
 
 def _image_size(solution: Solution) -> Float[np.ndarray, "N T"]:

@@ -159,7 +159,7 @@ def page(
         meanings = [pair for pair in meanings if pair[0] != "Size in the image"]
     if not report.has_error_bars:
         meanings = [pair for pair in meanings if pair[0] != "Error bars"]
-    if all(track.body is None for track in report.tracks):
+    if not report.body_lengths:
         meanings = [pair for pair in meanings if pair[0] != "Body"]
     section = None
     if behaviour is not None and report.over_time and report.poses:
@@ -220,8 +220,8 @@ def _table(report: Report) -> tuple[list[tuple[str, str]], list[tuple[Track, lis
     names.append(("Objective", "per pose"))
     names += [("Error bars", "% of length, 0 to 10 %" if over_time else "% of length")] if report.has_error_bars else []
     names += [("Size in the image", "±30 %")] if over_time else []
-    has_bodies = any(track.body is not None for track in report.tracks)
-    names += [("Body", "% of the model")] if has_bodies else []
+    if report.body_lengths:
+        names.append(("Body", f"{' / '.join(report.body_lengths)}, % of the model"))
     rows = []
     for track in report.tracks:
         quality, cells = track.quality, []
@@ -244,7 +244,7 @@ def _table(report: Report) -> tuple[list[tuple[str, str]], list[tuple[Track, lis
         if over_time:
             curve = size_curve(track)
             cells.append(Cell("–" if curve is None else "", curve))
-        if has_bodies:
-            cells.append(Cell(track.body or "–"))
+        if report.body_lengths:
+            cells.append(Cell(track.body))
         rows.append((track, cells))
     return names, rows
