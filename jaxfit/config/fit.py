@@ -141,9 +141,10 @@ class StageConfig:
     """Whether Adam starts with the moments of the previous stage instead of zeros."""
     keep_best: bool = False
     """Whether only the best hypothesis of each bird continues after this stage."""
-    share_body: bool = False
+    share_body: bool | Literal["species"] = False
     """Whether the bone lengths and the shape that this stage optimises in every window become one body for each track
-    (docs/method/bodies.md). The later stages keep the body."""
+    (docs/method/bodies.md). The later stages keep the body. `species`: the bodies of tracks of one species, such as
+    photographs, are also similar, as far as the data say."""
 
     def __post_init__(self):
         for name in self.terms:

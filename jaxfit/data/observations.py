@@ -80,6 +80,8 @@ class Observations:
     own_images: Mapping[tuple[int, int], tuple[str, int, int]] = field(default_factory=dict)
     """(n, t) → file name, width, height, where the image of a bird is not the image of the frame: in sets of
     photographs, every bird has frame 0 of an image of its own. Empty for video."""
+    species: Mapping[int, str] = field(default_factory=dict)
+    """Track id → name of the species. Tracks without a name are of one species. Empty if all tracks are."""
     occluded: np.ndarray | None = None
     """(N, T, K) bool: the keypoint is hidden, but its position is known. None means that no keypoint is hidden."""
     amodal_masks: Mapping[tuple[int, int], Mapping[str, Any]] = field(default_factory=dict)

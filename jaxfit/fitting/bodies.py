@@ -27,21 +27,30 @@ The windows of a track are added, and the body is the mean of
 
 Left and right bones differ by about 1 % (`ASYMMETRY_SD`), whatever the prior of the model says about them.
 
+Tracks of one species, such as photographs, may have similar bodies (`share_body: species`). With the covariance C of
+the prior, the body of a species differs from μ by m ~ N(0, (1 − d)·C), and a bird from its species by N(0, d·C), with
+one share d for bones and one for shape. The bodies are the means of their joint posterior, and d has the largest
+marginal likelihood on a grid. So d = 1 if birds of one species differ as much as any birds, and the bodies then do not
+depend on each other; d is near 0 if all tracks have one body. A track alone has the prior N(0, C) for every d.
+
 A second fit with fixed bodies follows, so that no window has a body of its own: the poses of a window would otherwise
 fit a body that the other windows contradict.
 
 Source: Kish 1965, *Survey Sampling* (n_eff, the design effect of clusters); Palmer and Strobeck 1986, *Fluctuating
-asymmetry: measurement, analysis, patterns* (differences between left and right of about 1 %). The rest is ours.
+asymmetry: measurement, analysis, patterns* (differences between left and right of about 1 %); Efron and Morris 1975,
+*Data analysis using Stein's estimator and its generalizations* (a variance that is learnt from the groups). The rest is
+ours.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
@@ -65,6 +74,9 @@ LONGEST = 3.0
 DIFFERENT, MIN_VARIANCE = 1e-4, 1e-3
 """Two halves of a track disagree where one body explains their difference with a smaller probability. Directions whose
 difference has a smaller variance, in units of the prior, do not count."""
+
+SHARES = 0.01, 0.03, 0.1, 0.2, 0.4, 0.7, 1.0
+"""Grid of the shares d."""
 
 
 class BodyEvidence(NamedTuple):
@@ -165,47 +177,103 @@ def estimate_bodies(
     evidence: Sequence[BodyEvidence | None],
     bird: Bird,
     config: FitConfig,
+    species: Int[np.ndarray, "N"] | None = None,
 ) -> dict[int, Body]:
     """Return the body of each track.
 
     Args:
-        track: the track of each window.
+        track: the position of the track of each window.
         evidence: of each window; None for a window that failed.
         bird: the model.
         config: the config, whose shared stage has the weights of the priors.
+        species: number of the species of each track; None for one species.
     """
     names = _body_numbers(config)
     mean, precision, broad = _prior(bird, config)
     prior = _symmetric(precision, bird) if "bone_length" in names else precision
     usable = [w for w, each in enumerate(evidence) if each is not None and np.isfinite(each.precision).all()]
 
-    def posterior(own: Sequence[BodyEvidence]) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return mean and covariance of the body of some windows, and n_eff."""
+    def of_data(own: Sequence[BodyEvidence]) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return ΣI·N⁻¹·I and ΣI·N⁻¹·s of some windows, and n_eff."""
         frames = sum(each.errors.max(initial=0) for each in own)
         counted = min(1 / max(_common_share(own), 1e-9), frames) if own else 0.0
         kappa, information, score = counted / max(frames, 1.0), np.zeros_like(precision), np.zeros_like(mean)
         for each in own if kappa else ():
             # rounding and ridges may leave slightly negative directions, which say nothing
             values, vectors = np.linalg.eigh((each.precision + each.precision.T) / 2 - precision)
-            of_data = (vectors * np.maximum(values, 0)) @ vectors.T
+            own_information = (vectors * np.maximum(values, 0)) @ vectors.T
             # the noise of the score; the small part of the prior keeps directions without data finite
-            noise = of_data / kappa + each.posture + 1e-9 * precision
-            gain = np.linalg.solve(noise, of_data).T
-            information += gain @ of_data
+            noise = own_information / kappa + each.posture + 1e-9 * precision
+            gain = np.linalg.solve(noise, own_information).T
+            information += gain @ own_information
             score += gain @ (each.precision - broad) @ (each.mean - mean)
-        covariance = np.linalg.inv(prior + information)
-        return mean + covariance @ score, (covariance + covariance.T) / 2, counted
+        return information, score, counted
 
+    def posterior(information: np.ndarray, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        covariance = np.linalg.inv(prior + information)
+        return covariance @ score, (covariance + covariance.T) / 2
+
+    tracks = np.unique(track)
+    own = [[cast(BodyEvidence, evidence[w]) for w in usable if track[w] == n] for n in tracks]
+    information, score, counted = zip(*map(of_data, own), strict=True)
+    if config.stages[cast(int, config.body_stage)].share_body == "species":
+        is_bone = np.arange(len(mean)) < ("bone_length" in names) * (bird.num_joints - 1)
+        group = np.zeros(len(tracks), int) if species is None else species[tracks]
+        found = _of_species(np.stack(information), np.stack(score), group, prior, is_bone)
+    else:
+        found = [posterior(*each) for each in zip(information, score, strict=True)]
     bodies = {}
-    for n in np.unique(track).tolist():
-        own = [cast(BodyEvidence, evidence[w]) for w in usable if track[w] == n]
-        numbers, covariance, counted = posterior(own)
+    of_model = np.asarray(bird.bone_mean, np.float32), np.zeros(bird.num_shapes, np.float32)
+    for n, windows, (change, covariance), frames in zip(tracks.tolist(), own, found, counted, strict=True):
         determined = len(mean) - float(np.trace(covariance @ prior))
-        half = len(own) // 2
-        agree = not half or _agree(posterior(own[:half])[:2], posterior(own[half:])[:2], prior)
-        of_model = np.asarray(bird.bone_mean, np.float32), np.zeros(bird.num_shapes, np.float32)
-        bodies[n] = Body(*_split(numbers, names, *of_model), covariance, counted, determined, agree)
+        halves = windows[: len(windows) // 2], windows[len(windows) // 2 :]
+        agree = not halves[0] or _agree(*(posterior(*of_data(half)[:2]) for half in halves), prior)
+        bodies[n] = Body(*_split(mean + change, names, *of_model), covariance, frames, determined, agree)
     return bodies
+
+
+def _of_species(
+    information: Float[np.ndarray, "N P P"],
+    score: Float[np.ndarray, "N P"],
+    species: Int[np.ndarray, "N"],
+    prior: Float[np.ndarray, "P P"],
+    is_bone: Bool[np.ndarray, "P"],
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return mean and covariance of the difference from the model for the body of each track.
+
+    Args:
+        information, score: what the data of each track say about its difference x from the model: −½xᵀGx + hᵀx.
+        species: of each track.
+        prior: precision of x.
+        is_bone: which numbers are bone lengths; the others are shape coefficients.
+    """
+    # in units of the prior, C = I
+    unit = np.linalg.inv(np.linalg.cholesky(prior))
+    G, h = unit @ information @ unit.T, score @ unit.T
+    member = species == np.unique(species)[:, None]
+    one = np.eye(len(prior))
+
+    def joint(shares: tuple[float, float]) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the marginal log-likelihood of the shares, and means and covariances of all tracks."""
+        d = np.where(is_bone, *shares)
+        # given m, x has the mean V·h + K·m and the covariance V; the data then say −½mᵀGK·m + (Kᵀh)ᵀm about m
+        K = np.linalg.inv(one + d[:, None] * G)
+        V, GK, Kh = K * d, G @ K, np.einsum("nba,nb->na", K, h)
+        likelihood = np.einsum("na,nab,nb->", h, V, h) + np.linalg.slogdet(K)[1].sum()
+        mean, covariance = np.zeros_like(h), np.zeros_like(G)
+        for some in member:
+            precision = one + (1 - d)[:, None] * GK[some].sum(0)
+            S, right = np.linalg.inv(precision) * (1 - d), Kh[some].sum(0)
+            likelihood += right @ S @ right - np.linalg.slogdet(precision)[1]
+            mean[some], covariance[some] = K[some] @ (S @ right), K[some] @ S @ K[some].swapaxes(1, 2)
+        return likelihood / 2, mean + np.einsum("nab,nb->na", V, h), covariance + V
+
+    shares = max(product(SHARES, SHARES), key=lambda each: joint(each)[0])
+    text = "birds of one species differ by %.0f %% of the variance of the prior in bones, and by %.0f %% in shape"
+    _logger.info(text, *(100 * share for share in shares))
+    _, mean, covariance = joint(shares)
+    covariance = unit.T @ covariance @ unit
+    return list(zip(mean @ unit, (covariance + covariance.swapaxes(1, 2)) / 2, strict=True))
 
 
 def _agree(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray], prior: Float[np.ndarray, "P P"]) -> bool:

@@ -204,7 +204,11 @@ def fit_runs(
     birds = len(np.unique(windows[0].track))
     subject = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
     known = known_rows(bodies, observations.track_id)
-    results, found = fit_windows(task, model, observations.num_tracks, subject, progress, stored, cluster, known)
+    names = [observations.species.get(track, "") for track in observations.track_id.tolist()]
+    species = np.unique(names, return_inverse=True)[1]
+    results, found = fit_windows(
+        task, model, observations.num_tracks, subject, progress, stored, cluster, known, species
+    )
     solutions = []
     for r, (config, some) in enumerate(zip(configs, windows, strict=True)):
         fitted = [results.pop((r, w)) for w in range(len(some))]

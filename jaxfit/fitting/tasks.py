@@ -211,6 +211,7 @@ def fit_windows(
     stored: StoredWindows | None = None,
     cluster: Cluster | None = None,
     known: Mapping[int, Body] | None = None,
+    species: Int[np.ndarray, "N"] | None = None,
 ) -> Fitted:
     """Fit the problems of a fit in batches, with progress, and store the windows of every batch when they are fitted.
 
@@ -226,6 +227,7 @@ def fit_windows(
         stored: the store of fitted windows, which are not fitted again, or None. Only for one config.
         cluster: worker processes; None: this process.
         known: position of a track → its body, which is used and not estimated.
+        species: number of the species of each track; None for one species.
 
     Returns:
         The results. A window whose task failed on the workers is not stored.
@@ -241,7 +243,7 @@ def fit_windows(
     for r, (config, of_run) in enumerate(zip(task.configs, task.windows, strict=True)):
         rows = [w for run, w in task.problems if run == r]
         evidence = [None if windows[r, w].failure else windows[r, w].body for w in rows]
-        bodies.append(estimate_bodies(of_run.track[rows], evidence, model.bird, config) | dict(known or {}))
+        bodies.append(estimate_bodies(of_run.track[rows], evidence, model.bird, config, species) | dict(known or {}))
         for w in rows:
             fitted, body = windows.pop((r, w)), bodies[r][int(of_run.track[w])]
             if fitted.failure:  # no later stage: the loss has the terms of the last stage

@@ -424,8 +424,7 @@ KEYPOINTS = (12, 18)
 def species(seed: int, quick: bool, _equal: bool) -> list[Scene]:
     """Draw pictures of 20 random species: half of the pictures have masks.
 
-    A track is a species, and its frames are pictures of different individuals in different poses from random
-    directions.
+    The pictures of a species show different individuals in different poses from random directions.
     """
     bird = published("aves", "aves")
     scenes = []
@@ -444,20 +443,20 @@ def pictures_of(bird: Bird, seed: int, numbers: Sequence[int], pictures: int, st
         bird: the mean model.
         seed: seed of species and pictures.
         numbers: numbers of the species; a number and a seed give one species and one annotator.
-        pictures: number of pictures of each species.
+        pictures: number of pictures of each species; each is a track with the name of its species.
         stream: pictures of different streams differ.
     """
-    N, T, K = len(numbers), pictures, bird.num_keypoints
+    N, K = len(numbers) * pictures, bird.num_keypoints
     rig, faces = fold_bird(bird), np.asarray(bird.faces)
     pose_at = jax.jit(lambda pose: (A := joint_transforms(rig, pose), posed_vertices(rig, A, pose)))
     weights, poses = np.asarray(bird.keypoint_weights, np.float64), []
-    exact_px, annotated_px, confidence = np.zeros((N, T, K, 2)), np.zeros((N, T, K, 2)), np.zeros((N, T, K))
-    masks, boxes = {}, np.zeros((N, T, 4), np.float32)
-    for n, number in enumerate(numbers):
+    exact_px, annotated_px, confidence = np.zeros((N, 1, K, 2)), np.zeros((N, 1, K, 2)), np.zeros((N, 1, K))
+    masks, boxes = {}, np.zeros((N, 1, 4), np.float32)
+    for s, number in enumerate(numbers):
         member = random_species(bird, 1000 * seed + number)
         betas, offsets = _shape_of(member, bird), draw_offsets(bird, np.random.default_rng((seed, number, 9)))
         rng = np.random.default_rng((seed, number, 10 + stream))
-        for t in range(T):
+        for n in range(s * pictures, (s + 1) * pictures):
             pose = random_pose(member, rng)
             bones = pose.bone_length * (1 + 0.02 * rng.standard_normal(len(pose.bone_length)))
             shape = betas + 0.2 * np.sqrt(np.asarray(bird.shape_variance)) * rng.standard_normal(bird.num_shapes)
@@ -471,28 +470,29 @@ def pictures_of(bird: Bird, seed: int, numbers: Sequence[int], pictures: int, st
             pose, vertices = replace(pose, transl=shift), vertices + shift
             points = weights @ vertices
             moved = np.einsum("kj,jab,kb->ka", np.asarray(rig.keypoint_map)[..., 3], A[..., :3], offsets)
-            exact_px[n, t] = project(points, CAMERA)
+            exact_px[n, 0] = project(points, CAMERA)
             noise = PICTURE_NOISE_PX * rng.standard_normal((K, 2))
-            annotated_px[n, t] = np.asarray(project(points + moved, CAMERA)) + noise
-            confidence[n, t, rng.permutation(K)[: rng.integers(KEYPOINTS[0], min(KEYPOINTS[1], K) + 1)]] = 1
+            annotated_px[n, 0] = np.asarray(project(points + moved, CAMERA)) + noise
+            confidence[n, 0, rng.permutation(K)[: rng.integers(KEYPOINTS[0], min(KEYPOINTS[1], K) + 1)]] = 1
             mask = hard_mask(np.asarray(to_screen(vertices, CAMERA), np.float32), faces, CAMERA.size_px, CAMERA.size_px)
-            masks[n, t], boxes[n, t] = encode_mask(mask), box_of_mask(mask) or (0, 0, 1, 1)
+            masks[n, 0], boxes[n, 0] = encode_mask(mask), box_of_mask(mask) or (0, 0, 1, 1)
             poses.append(pose)
     exact = Observations(
-        track_id=np.array(numbers) + 1,
-        frame_index=np.arange(T),
-        present=np.ones((N, T), bool),
+        track_id=np.arange(N) + 1,
+        frame_index=np.zeros(1, int),
+        present=np.ones((N, 1), bool),
         keypoints_px=exact_px,
-        confidence=np.ones((N, T, K)),
+        confidence=np.ones((N, 1, K)),
         box_px=boxes,
-        image_size_px=np.full((T, 2), CAMERA.size_px),
-        file_name=np.array([f"picture_{t}" for t in range(T)]),
+        image_size_px=np.full((1, 2), CAMERA.size_px),
+        file_name=np.array(["picture"]),
+        species={n + 1: f"species_{numbers[n // pictures]}" for n in range(N)},
         keypoint_names=bird.keypoint_names,
         masks=masks,
         amodal_masks=masks,
-        own_images={cell: (f"species_{cell[0]}/{cell[1]}.png", CAMERA.size_px, CAMERA.size_px) for cell in masks},
+        own_images={cell: (f"picture_{cell[0]}.png", CAMERA.size_px, CAMERA.size_px) for cell in masks},
     )
-    stacked = jax.tree.map(lambda *values: np.stack(values).reshape(N, T, *np.shape(values[0])), *poses)
+    stacked = jax.tree.map(lambda *values: np.stack(values).reshape(N, 1, *np.shape(values[0])), *poses)
     observed = replace(exact.with_keypoints(annotated_px, confidence), amodal_masks={})
     return Scene(bird, observed, exact, true_solution(bird, stacked, exact, CAMERA))
 

@@ -211,7 +211,9 @@ def measure(solution: Solution, scene: Scene, pictures: bool) -> tuple[BirdSums,
         own = {name: values[rows] for name, values in errors_3d(solution, scene, pictures).items()}
         spatial = BirdSums.of(sums.birds, own)
         sums = BirdSums(sums.birds, sums.numerators | spatial.numerators, sums.counts | spatial.counts)
-    return sums, evaluation.missing
+    # pictures of one species are not independent of each other
+    names = tuple(scene.observations.species.get(int(bird), bird) for bird in sums.birds)
+    return BirdSums(names, sums.numerators, sums.counts), evaluation.missing
 
 
 class Line(NamedTuple):

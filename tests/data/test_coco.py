@@ -147,6 +147,23 @@ def test_other_categories_are_left_out_and_said(tmp_path, caplog):
     assert "skipped 1 annotations" in caplog.text
 
 
+def test_categories_with_the_same_keypoints_are_species(tmp_path):
+    data = content()
+    bird = data["categories"][0]
+    data["categories"] = [bird | {"name": "murre"}, bird | {"id": 4, "name": "gull"}]
+    tracks = sorted({entry["track_id"] for entry in data["annotations"]})
+    assert read_coco(saved(tmp_path, data)).species == {}  # all are murres
+    for entry in data["annotations"]:
+        entry["category_id"] = 4 if entry["track_id"] == tracks[0] else bird["id"]
+    seen = read_coco(saved(tmp_path, data))
+    assert seen.species == {tracks[0]: "gull", tracks[1]: "murre"}
+    write_coco(seen, tmp_path / "again.json")
+    assert read_coco(tmp_path / "again.json").species == seen.species
+    written = json.loads((tmp_path / "again.json").read_text())
+    names = {category["id"]: category["name"] for category in written["categories"]}
+    assert {track["id"]: names[track["category_id"]] for track in written["tracks"]} == seen.species
+
+
 def test_images_that_share_a_frame(tmp_path):
     """Photographs: every bird is frame 0 of an image of its own, of its own size."""
     data = content()

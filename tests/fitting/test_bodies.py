@@ -2,10 +2,13 @@
 
 import argparse
 import dataclasses
+from itertools import product
 
 import jax
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
+from scipy.stats import multivariate_normal
 from support.birds import tiny_bird, toy_bird
 from support.fits import CAMERA, T, config
 
@@ -13,7 +16,15 @@ from jaxfit.cli.fitting import _known_bodies
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import StageConfig, load_config
 from jaxfit.data.solution import load_solution, save_solution
-from jaxfit.fitting.bodies import ASYMMETRY_SD, BodyEvidence, bodies_of, estimate_bodies
+from jaxfit.fitting.bodies import (
+    ASYMMETRY_SD,
+    SHARES,
+    BodyEvidence,
+    _prior,
+    _symmetric,
+    bodies_of,
+    estimate_bodies,
+)
 from jaxfit.fitting.error_bars import _with_body
 from jaxfit.fitting.fit import fit, fit_runs
 from jaxfit.fitting.posterior import BodySensitivity
@@ -65,6 +76,18 @@ def fitted():
     poses = individuals(2 * T)
     observed = detect(BIRD, poses, 0.1, 0.0, 0, camera=CAMERA)
     return observed, fit(observed, BIRD, dataclasses.replace(CONFIG, error_bars=True))
+
+
+def with_species(body, terms):
+    """Return the config whose shared stage optimises some numbers of a body, for birds of species."""
+    first, shared, last = stages()
+    shared = dataclasses.replace(
+        shared,
+        optimised=(*POSE, *body),
+        share_body="species",
+        terms=(*shared.terms, *(("shape_prior",) if "betas" in body else ())),
+    )
+    return dataclasses.replace(CONFIG, terms=terms, stages=(first, shared, last))
 
 
 def evidence(window_means, precision, errors):
@@ -162,6 +185,65 @@ def test_two_birds_under_one_track(difference, agree):
         (body,) = estimate_bodies(np.zeros(4, int), windows, BIRD, CONFIG).values()
         wrong += body.agree != agree
     assert wrong == 0
+
+
+@pytest.mark.parametrize("true_share", [0.1, 1.0])
+def test_bodies_of_species_are_the_joint_posterior(true_share):
+    """The oracle: all bodies and all data as one Gaussian, for every pair of shares on the grid."""
+    rng, bird = np.random.default_rng(6), tiny_bird(shapes=2)
+    settings = with_species(("bone_length", "betas"), {**TERM_SETTINGS, "shape_prior": 0.5})
+    mean, precision, broad = _prior(bird, settings)
+    C, species = np.linalg.inv(_symmetric(precision, bird)), np.array([7, 3, 7, 5, 7, 3, 3, 7])
+    (P, N), same = (len(mean), len(species)), species[:, None] == species
+
+    def covariance(of_bones, of_shape):
+        root = np.sqrt(np.where(np.arange(P) < BONES, of_bones, of_shape))
+        within, between = C * np.outer(root, root), C * np.outer(np.sqrt(1 - root**2), np.sqrt(1 - root**2))
+        return np.kron(np.eye(N), within) + np.kron(same, between)
+
+    x = rng.multivariate_normal(np.zeros(N * P), covariance(true_share, true_share))
+    J = 30 * rng.standard_normal((N, 8, P))
+    J[-2] = 0  # nothing is seen of this bird
+    y = np.einsum("nyp,np->ny", J, x.reshape(N, P)) + rng.standard_normal((N, 8))
+    dense = block_diag(*J)
+    grid, best = {}, {}
+    for shares in product(SHARES, SHARES):
+        S = covariance(*shares)
+        of_data = dense @ S @ dense.T + np.eye(len(dense))
+        grid[shares] = multivariate_normal(np.zeros(len(dense)), of_data).logpdf(y.ravel())
+        gain = np.linalg.solve(of_data, dense @ S).T
+        best[shares] = gain @ y.ravel(), S - gain @ dense @ S
+    shares = max(grid, key=grid.get)
+    assert np.allclose(shares, true_share, atol=0.3)
+    white = rng.standard_normal((50, 8, 2))
+    white -= white.mean(0)  # no common part: all frames count
+    windows = []
+    for n in range(N):
+        A = J[n].T @ J[n] + precision
+        windows.append(evidence(mean + np.linalg.solve(A - broad, J[n].T @ y[n]), A, white))
+    bodies = estimate_bodies(np.arange(N), windows, bird, settings, species)
+    expected, spread = best[shares]
+    for n, body in bodies.items():
+        own = slice(n * P, (n + 1) * P)
+        found = np.concatenate([body.bone_length, body.betas])
+        np.testing.assert_allclose(found, mean + expected[own], rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(body.covariance, spread[own, own], rtol=1e-4, atol=1e-7)
+
+
+def test_a_bird_alone_in_its_species_has_its_own_body(fitted):
+    observed, solution = fitted
+    own = dataclasses.replace(with_species(("bone_length",), TERM_SETTINGS), error_bars=True)
+    alone = fit(dataclasses.replace(observed, species={0: "murre", 1: "gull"}), BIRD, own)
+    np.testing.assert_allclose(alone.bodies.bone_length, solution.bodies.bone_length, atol=1e-5)
+    # these two birds differ as much as any birds, so the data of one say nothing about the other
+    np.testing.assert_allclose(fit(observed, BIRD, own).bodies.bone_length, solution.bodies.bone_length, atol=1e-5)
+    second = dataclasses.replace(individuals(2 * T)[1], bone_length=LENGTHS[0])
+    equal = detect(BIRD, [individuals(2 * T)[0], second], 0.1, 0.0, 0, camera=CAMERA)
+    apart, together = (
+        fit(dataclasses.replace(equal, species=names), BIRD, own).bodies for names in ({0: "murre", 1: "gull"}, {})
+    )
+    assert np.abs(np.diff(together.bone_length, axis=0)).max() < 0.5 * np.abs(np.diff(apart.bone_length, axis=0)).max()
+    assert (together.bone_length_sd < apart.bone_length_sd).all()
 
 
 def test_without_a_usable_window_the_body_is_that_of_the_model():

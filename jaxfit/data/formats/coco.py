@@ -22,8 +22,8 @@ Conventions of the reader:
   annotation is 1.
 - Only 0, 1 and 2 are visibilities. A file with other numbers holds scores in their place, as MMPose and detectron2
   write them.
-- The first category with keypoints is the bird. Categories with the same keypoints in the same order, such as several
-  species, are birds too. Annotations of other categories are skipped, and one warning reports their number.
+- The first category with keypoints is the bird. Categories with the same keypoints in the same order are birds too, of
+  other species. Annotations of other categories are skipped, and one warning reports their number.
 - A file without annotations is a video without birds. A file with annotations of other categories only is rejected.
 - A crowd (``iscrowd`` 1) has no mask, since its region covers several birds.
 - Several images may share a ``frame_index`` (photographs, several videos); each track keeps its own image.
@@ -169,6 +169,9 @@ def coco_observations(root: Field) -> Observations:
             timestamp_s=np.array([first_image[f].timestamp_s for f in frames]),
             fps=float(info["fps"].value) if info.has("fps") else None,
             footage=footage_of(info["footage"]) if info.has("footage") else None,
+            species={bird.track_id: bird.species for bird in birds}
+            if len({bird.species for bird in birds}) > 1
+            else {},
             own_images={
                 cell: (bird.image.file_name, bird.image.width, bird.image.height)
                 for cell, bird in holder.items()
@@ -223,7 +226,9 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         # the image of the frame comes before other images of the same frame
         image_id(t, str(observations.file_name[t]), width, height)
     annotations = []
-    masks = observations.masks
+    masks, species = observations.masks, observations.species
+    names = sorted({species.get(track, "bird") for track in observations.track_id.tolist()} or {"bird"})
+    category_of = {track: names.index(species.get(track, "bird")) + 1 for track in observations.track_id.tolist()}
     # one at a time: pycocotools fails for a list of more than 255 masks
     areas = {place: int(coco_mask.area(cast(Any, mask))) for place, mask in masks.items()}
     scores = cast(np.ndarray, observations.score)
@@ -235,7 +240,7 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         annotation = {
             "id": len(annotations) + 1,
             "image_id": image_id(t, observations.image_file(n, t), *observations.image_size(n, t)),
-            "category_id": 1,
+            "category_id": category_of[int(observations.track_id[n])],
             "track_id": int(observations.track_id[n]),
             "bbox": _shortest(observations.box_px[n, t]).tolist(),
             "iscrowd": 0,
@@ -253,12 +258,12 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
             annotation["area"] = areas[n, t]
         annotations.append(annotation)
     skeleton = [[a + 1, b + 1] for a, b in observations.skeleton]
-    category = {"id": 1, "name": "bird", "keypoints": list(observations.keypoint_names), "skeleton": skeleton}
+    keypoints = {"keypoints": list(observations.keypoint_names), "skeleton": skeleton}
     content: dict[str, Any] = {
         "images": list(images.values()),
-        "categories": [category],
+        "categories": [{"id": i + 1, "name": name, **keypoints} for i, name in enumerate(names)],
         "annotations": annotations,
-        "tracks": _tracks(observations),
+        "tracks": _tracks(observations, category_of),
     }
     about: dict[str, Any] = dict(info or {}) | ({} if observations.fps is None else {"fps": observations.fps})
     about |= {} if observations.footage is None else {"footage": observations.footage.entries()}
@@ -273,12 +278,13 @@ def _json_rle(rle: Mapping[str, Any]) -> dict[str, Any]:
     return {"size": [int(side) for side in rle["size"]], "counts": counts}
 
 
-def _tracks(observations: Observations) -> list[dict[str, Any]]:
+def _tracks(observations: Observations, category_of: Mapping[int, int]) -> list[dict[str, Any]]:
     """Return the entries of ``tracks``."""
     tracks = []
     for quality in track_quality(observations):
         values = quality._asdict()
-        track = {"id": values.pop("track_id"), "category_id": 1}
+        track_id = values.pop("track_id")
+        track = {"id": track_id, "category_id": category_of[track_id]}
         tracks.append(track | {key: round(v, 6) if isinstance(v, float) else v for key, v in values.items()})
     return tracks
 

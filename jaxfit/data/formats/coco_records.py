@@ -80,6 +80,8 @@ class Annotation(NamedTuple):
     label: str
     """Name in messages."""
     track_id: int
+    species: str
+    """Name of the category."""
     image: Image
     keypoints: np.ndarray
     """(K, 3): x, y in image pixels, visibility."""
@@ -138,8 +140,8 @@ class Categories(NamedTuple):
     names: tuple[str, ...]
     skeleton: tuple[tuple[int, int], ...]
     """Pairs counted from 0."""
-    is_bird: dict[int | str, bool]
-    """Id of a category → whether its keypoints are those of the bird."""
+    species: dict[int | str, str | None]
+    """Id of a category → its name if its keypoints are those of the bird, else None."""
 
 
 def read_categories(root: Field) -> Categories:
@@ -150,10 +152,10 @@ def read_categories(root: Field) -> Categories:
     """
     names: tuple[str, ...] = ()
     skeleton: tuple[tuple[int, int], ...] = ()
-    is_bird: dict[int | str, bool] = {}
+    species: dict[int | str, str | None] = {}
     for i, category in enumerate(_table(root, "categories")):
         with errors_of(root, f"categories[{i}]"):
-            if category["id"] in is_bird:
+            if category["id"] in species:
                 raise ValueError(f"id {category['id']!r} occurs for the second time")
             own_names = tuple(category.get("keypoints") or ())
             if not all(isinstance(name, str) for name in own_names):
@@ -167,11 +169,12 @@ def read_categories(root: Field) -> Categories:
                     raise ValueError(
                         f"skeleton {pairs} names keypoints that are not {first} to {len(names) + first - 1}"
                     )
-            is_bird[category["id"]] = bool(names) and own_names == names
+            is_bird = bool(names) and own_names == names
+            species[category["id"]] = str(category.get("name") or "") if is_bird else None
     if not names:
         remedy = "add the names of the keypoints to the category of the bird"
         raise InputError(root.source, "categories hold none with keypoints", remedy)
-    return Categories(names, skeleton, is_bird)
+    return Categories(names, skeleton, species)
 
 
 def read_annotations(
@@ -186,16 +189,19 @@ def read_annotations(
     others = 0
     for i, entry in enumerate(_table(root, "annotations")):
         with errors_of(root, f"annotations[{i}]"):
-            if entry["category_id"] not in categories.is_bird:
+            if entry["category_id"] not in categories.species:
                 raise ValueError(f"category_id is {entry['category_id']!r}, which no category has")
-            if categories.is_bird[entry["category_id"]]:
-                birds.append(_annotation(entry, f"annotations[{i}]", images, len(categories.names)))
+            species = categories.species[entry["category_id"]]
+            if species is not None:
+                birds.append(_annotation(entry, f"annotations[{i}]", species, images, len(categories.names)))
             else:
                 others += 1
     return birds, others
 
 
-def _annotation(entry: dict[str, Any], label: str, images: Mapping[int | str, Image], num_keypoints: int) -> Annotation:
+def _annotation(
+    entry: dict[str, Any], label: str, species: str, images: Mapping[int | str, Image], num_keypoints: int
+) -> Annotation:
     if entry["image_id"] not in images:
         raise ValueError(f"image_id is {entry['image_id']!r}, which no image has")
     image = images[entry["image_id"]]
@@ -221,6 +227,7 @@ def _annotation(entry: dict[str, Any], label: str, images: Mapping[int | str, Im
     return Annotation(
         f"id {entry['id']!r} ({label})" if "id" in entry else label,
         _whole(entry["track_id"]),
+        species,
         image,
         keypoints,
         scores,
