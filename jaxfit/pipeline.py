@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxfit.behaviour.result import shown_behaviour
-from jaxfit.config.build import plain_config
+from jaxfit.config.build import plain_config, with_values
 from jaxfit.config.fit import FitConfig
-from jaxfit.config.perception import TrackConfig
+from jaxfit.config.perception import NONE, TrackConfig
 from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.data.keypoint_names import NameMap, map_keypoints, names_in_model
+from jaxfit.data.keypoint_names import NameMap, map_keypoints, names_in_model, propose_names
 from jaxfit.data.observations import Observations
 from jaxfit.data.result_folder import OBSERVATIONS, OVERLAY, POSES
 from jaxfit.data.solution import Solution, write_solution
@@ -34,9 +34,11 @@ from jaxfit.foundation.workers import Cluster
 from jaxfit.model.bird import Bird, model_hash
 from jaxfit.model.files import load_murre
 from jaxfit.perception.detections import check_segmenter, network_files, open_keypoint_detector
+from jaxfit.perception.keypoints import NoKeypoints
+from jaxfit.perception.label_flow import carry_labels, origin_counts, read_few_labels
 from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segmenter
-from jaxfit.perception.track import TrackingResult, run_tracking
+from jaxfit.perception.track import TrackingResult, given_tracks, run_tracking
 from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import VideoInfo, probe_video
 from jaxfit.view.overlay import check_outputs, is_inside, overlay
@@ -183,6 +185,8 @@ def reconstruct(
     overwrite: bool = False,
     progress: ProgressTask = silent,
     cluster: Cluster | None = None,
+    labels: str | Path | None = None,
+    masks: str | Path | None = None,
 ) -> Reconstruction:
     """Track the birds of a video, fit their poses and draw them on the video.
 
@@ -204,13 +208,18 @@ def reconstruct(
         overwrite: replace an earlier result in the folder.
         progress: receives the progress of every part.
         cluster: worker processes that run the networks of `config` and fit the windows. None: this process.
+        labels: keypoints of a few frames in any format of observations. Optical flow carries them to the other frames,
+            and no keypoint network runs. None: a network detects the keypoints.
+        masks: a folder of pictures in which every grey value is one bird, or a file of observations: the tracks with
+            their masks, in place of tracking.
 
     Returns:
         The result. A failed fit of one bird appears in the bird's status and does not affect other birds.
 
     Raises:
         InputError: no video; an unusable network or tracker; a network without keypoints of the model; a folder that
-            cannot be written, holds the video or holds other files; a video without birds (`NoTrackError`); unfinished
+            cannot be written, holds the video or holds other files; a video without birds (`NoTrackError`); labels of
+            other keypoints, or of no tracked bird; unfinished
             work of another video, config, model or version; another process that works on the same result; a cluster
             that ends.
     """
@@ -223,11 +232,21 @@ def reconstruct(
         check_replaceable(folder, overwrite, POSES)
         bird, config = bird or load_murre(), config or load_reconstruct_config()
         model_of_fit(bird, config.fit)  # reports a setting that cannot be used before the tracking
-        config, networks = _choose(config, video, bird, segmenter, keypoints, progress)
+        labelled = None if labels is None else read_few_labels(labels, video, bird.keypoint_names)
+        if labelled is not None:
+            config = with_values(config, {"track.keypoints.file": NONE})
+        given = None if masks is None else given_tracks(masks, video)
+        config, networks = _choose(config, video, bird, segmenter, keypoints, progress, given is not None)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
             store = Store(unfinished, config, video, bird, networks, progress)
-            tracking = _track(video, config.track, networks, bird, store, progress, cluster)
+            tracking = given or _track(video, config.track, networks, bird, store, progress, cluster)
+            tracking = tracking._replace(observations=_with_names(tracking.observations, networks.names, bird))
+        carried = None
+        if labelled is not None:
+            with clock("labels"):
+                carried = carry_labels(tracking.observations, labelled, video, labels, progress)
+                tracking = tracking._replace(observations=carried.observations)
         with clock("fit"):
             learnt_yaml = None
             if config.fit.learn_weights:
@@ -240,6 +259,9 @@ def reconstruct(
             with clock("overlay"):
                 _draw(solution, bird, video, part / OVERLAY, tracking.observations, config.overlay, progress)
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
+            if carried is not None:
+                facts = {"file": str(labels), "used": carried.used, "problems": carried.problems}
+                summary["labels"] = facts | {"frames": origin_counts(tracking.observations)}
             settings = config_to_yaml(config)
             write_coco(tracking.observations, part / OBSERVATIONS, tracking.info())
             write_solution(solution, bird, settings, summary, part, learnt_yaml)
@@ -265,8 +287,12 @@ def _choose(
     segmenter: Segmenter | None,
     keypoints: KeypointDetector | None,
     progress: ProgressTask,
+    has_tracks: bool,
 ) -> tuple[ReconstructConfig, Networks]:
-    """Return the config with a checked segmenter in place of `auto`, and the networks."""
+    """Return the config with a checked segmenter in place of `auto`, and the networks; none for given tracks."""
+    if has_tracks:
+        config = with_values(config, {"track.keypoints.file": NONE})
+        return config, Networks(None, NoKeypoints(), None, {}, False, names_in_model((), bird.keypoint_names, ""))
     kinds = {"segmenter": segmenter, "keypoints": keypoints}
     keypoints = keypoints or open_keypoint_detector(config.track)
     choice = None
@@ -289,7 +315,7 @@ def _track(
     progress: ProgressTask,
     cluster: Cluster | None,
 ) -> TrackingResult:
-    """Track the birds, with the keypoints of the model; raise the failure of tracking.
+    """Track the birds; raise the failure of tracking.
 
     Stored frames that cannot help another call are discarded.
     """
@@ -302,8 +328,7 @@ def _track(
         parts=store.frames,
         cluster=cluster if networks.all_of_config else None,
     )
-    observations = map_keypoints(tracking.observations, networks.names, bird.keypoint_names)
-    tracking = tracking._replace(choice=networks.choice, observations=observations)
+    tracking = tracking._replace(choice=networks.choice)
     if tracking.failure is None:
         return tracking
     if store.frames is not None and not (tracking.short_tracks or tracking.low_score_tracks):
@@ -311,6 +336,13 @@ def _track(
     failure = NoTrackError(tracking.failure.source, tracking.failure.problem, tracking.failure.remedy)
     failure.tracking = tracking
     raise failure
+
+
+def _with_names(observations: Observations, names: NameMap, bird: Bird) -> Observations:
+    """Return the observations with the keypoints of the model; `names` maps the keypoints of the network."""
+    if not names.mapped:  # given tracks have names of their own
+        names = propose_names(observations.keypoint_names, bird.keypoint_names)
+    return map_keypoints(observations, names, bird.keypoint_names)
 
 
 @contextmanager

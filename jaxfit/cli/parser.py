@@ -82,6 +82,11 @@ def _demo(command: Parser) -> None:
 def _reconstruct(command: Parser) -> None:
     """Track the birds of a video, fit their poses and draw them."""
     add_tracking_options(command)
+    text = "keypoints that you marked in a few frames (formats as OBS of `jaxfit fit`); optical flow carries them to "
+    text += "the other frames, and no keypoint network runs; without --config, the fit is that of `few_labels`"
+    command.add_argument("--labels", type=Path, metavar="LABELS", help=text)
+    text = "masks in place of a segmenter: a folder of pictures in which every grey value is one bird, or a COCO file"
+    command.add_argument("--masks", type=Path, metavar="MASKS", help=text)
     command.shared("--model")
     add_cluster(command, "run the networks and fit windows")
     add_out(command, "DIR", "folder for the result", overwrite="an earlier result in the folder")

@@ -51,13 +51,21 @@ def track(options: argparse.Namespace) -> None:
 
 def reconstruct(options: argparse.Namespace) -> None:
     """Track the birds of a video, fit their poses and draw them."""
+    from dataclasses import replace
+
+    from jaxfit.config.fit import load_config
+    from jaxfit.config.perception import NONE
     from jaxfit.data.result_folder import OBSERVATIONS, OVERLAY, POSES, SUMMARY
     from jaxfit.foundation.workers import open_cluster
     from jaxfit.pipeline import NoTrackError, reconstruct
+    from jaxfit.view.report.contents import on_what
     from jaxfit.view.report.write import REPORT
 
     start = time.perf_counter()
     config = reconstruct_config(options)
+    has_network = options.labels is None and options.masks is None and config.track.keypoints.file != NONE
+    if options.config == "reconstruct" and not has_network:
+        config = replace(config, fit=load_config("few_labels"))
     bird = find_bird(options.model)
     with open_cluster(options.workers, options.scheduler) as cluster:
         try:
@@ -69,14 +77,18 @@ def reconstruct(options: argparse.Namespace) -> None:
                 overwrite=options.overwrite,
                 progress=terminal,
                 cluster=cluster,
+                labels=options.labels,
+                masks=options.masks,
             )
         except NoTrackError as error:
             _show_failure(error.tracking, config.track.min_track_frames)
             raise
-    if done.names.changes_names:
+    if done.names.mapped and done.names.changes_names:
         how = "mapped by their words; `jaxfit track` and `jaxfit fit --names MAP.yaml` use another map"
         show_names(done.names, Path(config.track.keypoints.file).name, how)
     _show_trust(done.tracking, done.tracking.trust.sentence())
+    for track, frames in done.summary.get("labels", {}).get("frames", {}).items():
+        show(f"poses of track {track}: {on_what(frames)}")
     show(flag_line(done.solution))
     show(track_table(done.tracking.observations, done.solution))
     _show_skipped_tracks(done.tracking, config.track.min_track_frames)

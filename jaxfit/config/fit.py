@@ -190,8 +190,8 @@ class FitConfig:
     """Edge of the silhouette. `soft_rasterizer`: as published; the silhouette is larger than its mesh, by 1.5 pixels at
     blur 1. `unbiased`: the covered area of the pixels, filtered like the mask; the silhouette has the area of its
     mesh."""
-    min_keypoints: PositiveInt = 4
-    """Number of confident keypoints that a frame needs to be fitted."""
+    min_keypoints: NonNegativeInt = 4
+    """Number of keypoints that a frame needs to be fitted. 0: a frame with a mask needs no keypoint."""
     crop: CropConfig = CropConfig()
     initialise: InitialiseConfig = InitialiseConfig()
     error_bars: bool = False

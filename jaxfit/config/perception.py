@@ -30,6 +30,8 @@ class FramesConfig:
 
 AUTO, BUILTIN, GENERAL = "auto", "builtin", "general"
 """Names of segmenters in place of a file."""
+NONE = "none"
+"""Name of no keypoint network, in place of a file."""
 
 
 @config_dataclass
@@ -65,7 +67,8 @@ class KeypointsConfig:
     """The network that detects the keypoints of each bird."""
 
     file: str = "builtin"
-    """Network that detects keypoints: `builtin` (for murres, trained on simulated footage) or an ONNX file."""
+    """Network that detects keypoints: `builtin` (for murres, trained on simulated footage), an ONNX file, or `none`
+    (the poses follow from the outlines)."""
     kind: str = "auto"
     """Layout of the network's output: heatmap, deeplabcut, simcc; `auto` infers the layout from the file's inputs and
     outputs."""

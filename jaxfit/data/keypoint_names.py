@@ -103,13 +103,13 @@ def propose_names(names: Sequence[str], model_names: Sequence[str]) -> NameMap:
 
 
 def names_in_model(names: Sequence[str], model_names: Sequence[str], source: object) -> NameMap:
-    """Return the proposed map of the keypoints of a network.
+    """Return the proposed map of the keypoints of a network, which may have none.
 
     Raises:
         InputError: fewer than `MIN_KEYPOINTS` keypoints are keypoints of the model.
     """
     found = propose_names(names, model_names)
-    if len(found.mapped) < MIN_KEYPOINTS:
+    if names and len(found.mapped) < MIN_KEYPOINTS:
         problem = f"keypoints lack {', '.join(found.missing)}: fewer than {MIN_KEYPOINTS} are keypoints of the model"
         raise InputError(source, problem, "rename the keypoints as in the model, or choose another model")
     return found

@@ -25,6 +25,7 @@ _LAYOUT = {
     "confidence": ("N T K", np.float32),
     "occluded": ("N T K", np.bool_),
     "score": ("N T", np.float32),
+    "keypoint_origin": ("N T", np.int8),
     "box_px": ("N T 4", np.float32),
     "image_size_px": ("T 2", np.int64),
     "file_name": ("T", np.str_),
@@ -35,6 +36,10 @@ CELLS = tuple(name for name, (shape, _) in _LAYOUT.items() if shape.startswith("
 """Arrays with a value for every track and frame."""
 LARGEST_POSITION_PX = 1e6
 """Largest absolute image position; greater numbers overflow or have a wrong unit."""
+KEYPOINT_ORIGINS = "", "label", "flow"
+"""Where the keypoints of a bird in a frame come from: a detector or a file that does not say so; a person; a person's
+label in another frame, by optical flow."""
+FROM_LABEL, FROM_FLOW = 1, 2
 MIN_KEYPOINTS = 3
 """Fewer keypoints do not determine the orientation of a bird."""
 MAPPINGS = ("masks", "amodal_masks", "own_images")
@@ -89,6 +94,8 @@ class Observations:
     score: np.ndarray | None = None
     """(N, T) float32 in [0, 1]: score of the detection of the bird; 0 where not present. None means 1 where
     present."""
+    keypoint_origin: np.ndarray | None = None
+    """(N, T) int8: where the keypoints come from, as a position in `KEYPOINT_ORIGINS`. None means 0."""
     timestamp_s: np.ndarray | None = None
     """(T,) float64: presentation times of the frames in seconds, as ``jaxfit.video.reader.Frame.time_s``; NaN where the
     time is unknown. None means that no time is known."""
@@ -101,8 +108,9 @@ class Observations:
         occluded = np.zeros(np.shape(self.confidence), bool) if self.occluded is None else self.occluded
         score = np.asarray(self.present, np.float32) if self.score is None else self.score
         timestamp_s = np.full(np.shape(self.frame_index), np.nan) if self.timestamp_s is None else self.timestamp_s
+        origin = np.zeros(np.shape(self.present), np.int8) if self.keypoint_origin is None else self.keypoint_origin
         values = {**vars(self), "keypoint_names": list(self.keypoint_names), "occluded": occluded, "score": score}
-        arrays = validate_arrays(values | {"timestamp_s": timestamp_s}, _LAYOUT)
+        arrays = validate_arrays(values | {"timestamp_s": timestamp_s, "keypoint_origin": origin}, _LAYOUT)
         check_times(arrays["timestamp_s"], self.fps)
         names = tuple(str(name) for name in arrays.pop("keypoint_names"))
         twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
@@ -215,8 +223,15 @@ class Observations:
         return image[0] if image else str(self.file_name[t])
 
     def usable(self, min_keypoints: int = MIN_KEYPOINTS) -> np.ndarray:
-        """Return where a bird has enough keypoints for a fit, (N, T) bool: it is present with ``min_keypoints``."""
-        return self.present & ((self.confidence > 0).sum(-1) >= min_keypoints)
+        """Return where a bird can be fitted, (N, T) bool: it is present with ``min_keypoints``.
+
+        With 0, a bird without any keypoint can be fitted if it has a mask.
+        """
+        known = (self.confidence > 0).sum(-1)
+        usable = self.present & (known >= min_keypoints)
+        for n, t in np.argwhere(usable & (known == 0)).tolist():
+            usable[n, t] = (n, t) in self.masks
+        return usable
 
     def select(self, tracks: Any = None, frames: Any = None) -> Observations:
         """Return the observations of some tracks and frames.

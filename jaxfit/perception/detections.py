@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfit.config.checks import require
-from jaxfit.config.perception import AUTO, BUILTIN, FramesConfig, TrackConfig
+from jaxfit.config.perception import AUTO, BUILTIN, NONE, FramesConfig, TrackConfig
 from jaxfit.foundation.errors import one_line
 from jaxfit.foundation.progress import Clock
 from jaxfit.foundation.unfinished import Parts
-from jaxfit.perception.keypoints import BUILTIN_PATH, load_keypoint_detector
+from jaxfit.perception.keypoints import BUILTIN_PATH, NoKeypoints, load_keypoint_detector
 from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
 from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
 from jaxfit.perception.tracking import RecordedFrame, Tracker, record_frame
@@ -69,6 +69,8 @@ def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
         InputError: the keypoint detector cannot be used.
     """
     settings = config.keypoints
+    if settings.file == NONE:
+        return NoKeypoints()
     return load_keypoint_detector(
         settings.file,
         kind=settings.kind,
@@ -83,8 +85,9 @@ def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
 
 def network_files(config: TrackConfig) -> dict[str, list[Path]]:
     """Return the files of the networks of a config, under the keys `segmenter` and `keypoints`."""
-    keypoints = BUILTIN_PATH if config.keypoints.file == "builtin" else Path(config.keypoints.file)
-    return {"segmenter": segmenter_files(_segmenter_name(config)), "keypoints": [keypoints]}
+    file = config.keypoints.file
+    keypoints = [] if file == NONE else [BUILTIN_PATH if file == "builtin" else Path(file)]
+    return {"segmenter": segmenter_files(_segmenter_name(config)), "keypoints": keypoints}
 
 
 def _segmenter_name(config: TrackConfig) -> str:

@@ -230,6 +230,18 @@ class OnnxKeypoints:
         return self._input.array(batch), crops
 
 
+class NoKeypoints:
+    """A keypoint detector without keypoints, for footage whose keypoints come from labels, or not at all."""
+
+    keypoint_names: tuple[str, ...] = ()
+
+    def __call__(
+        self, frame: UInt8[np.ndarray, "H W 3"], instances: Sequence[Instance]
+    ) -> tuple[Float[np.ndarray, "M 0 2"], Float[np.ndarray, "M 0"]]:
+        """Return arrays without keypoints."""
+        return np.zeros((len(instances), 0, 2), np.float32), np.zeros((len(instances), 0), np.float32)
+
+
 def load_keypoint_detector(
     spec: str | Path = "builtin",
     *,

@@ -13,6 +13,9 @@ import numpy as np
 
 from jaxfit.config.perception import TrackConfig
 from jaxfit.data.footage import read_footage
+from jaxfit.data.formats.image_sizes import add_times, check_video
+from jaxfit.data.formats.mask_files import mask_observations
+from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import Clock, ProgressTask, silent
@@ -192,6 +195,22 @@ def run_tracking(
     if observations.num_tracks:
         return tracking
     return tracking._replace(failure=_failure(source, config, tracking, records, min_score, has_own_segmenter))
+
+
+def given_tracks(masks: str | Path, video: Path) -> TrackingResult:
+    """Return tracks with the masks of a folder of pictures or of a file of observations, in place of tracking.
+
+    Raises:
+        InputError: the masks cannot be read, or are not those of the video.
+    """
+    masks = Path(masks)
+    observations = mask_observations(masks) if masks.is_dir() else read_observations(masks, video)
+    if not observations.masks:
+        raise InputError(masks, "holds no mask", "give a folder of pictures of masks, or observations with masks")
+    check_video(observations, masks, video)
+    observations = add_times(observations, video)
+    trust = judge(footage_signals(observations, {}))
+    return TrackingResult(observations, {}, {}, [], None, trust, None, {})
 
 
 def _failure(

@@ -36,7 +36,13 @@ def test_every_config_says_what_it_is_for():
     groups = {name: shipped_comment(name)["group"] for name in shipped_fit_configs()}
     published = {name for name, group in groups.items() if group == GROUPS[0]}
     assert published == {"paper", "baseline", "aves"}
-    assert {name for name, group in groups.items() if group == GROUPS[1]} == {"fast", "balanced", "map", "photo"}
+    assert {name for name, group in groups.items() if group == GROUPS[1]} == {
+        "fast",
+        "balanced",
+        "few_labels",
+        "map",
+        "photo",
+    }
     for config in describe_fit_configs():
         for text in (config.purpose, config.chosen_on):
             assert text.endswith(".")

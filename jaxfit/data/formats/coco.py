@@ -10,7 +10,8 @@ The file is an object with
   from 0 where a 0 occurs);
 - ``annotations``: ``image_id``, ``category_id``, ``track_id``, ``bbox`` [x, y, width, height] and
   ``keypoints`` [x, y, v, …] in image pixels, optionally ``segmentation`` (run lengths or polygons),
-  ``keypoint_scores`` (K numbers in [0, 1]), ``score`` (of the bird as a whole, in [0, 1]), ``iscrowd``, ``id``.
+  ``keypoint_scores`` (K numbers in [0, 1]), ``score`` (of the bird as a whole, in [0, 1]), ``keypoint_origin``
+  (``label`` or ``flow``), ``iscrowd``, ``id``.
 
 A written file also has ``tracks``, for people who open the file: ``id``, ``category_id`` and the fields of
 ``jaxfit.data.tracks.TrackQuality``. The reader ignores ``tracks``, which follow from the annotations.
@@ -57,7 +58,7 @@ from jaxfit.data.formats.coco_records import (
 )
 from jaxfit.data.formats.fields import Field, read_json
 from jaxfit.data.formats.rle import first_invalid
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import KEYPOINT_ORIGINS, Observations
 from jaxfit.data.tracks import track_quality
 from jaxfit.foundation.array_files import check_memory, observations_bytes
 from jaxfit.foundation.errors import InputError
@@ -166,6 +167,7 @@ def coco_observations(root: Field) -> Observations:
             amodal_masks=masks["amodal_rle"],
             occluded=placed(occluded, K, dtype=bool),
             score=placed([bird.score for bird in birds]),
+            keypoint_origin=placed([bird.origin for bird in birds], dtype=np.int8),
             timestamp_s=np.array([first_image[f].timestamp_s for f in frames]),
             fps=float(info["fps"].value) if info.has("fps") else None,
             footage=footage_of(info["footage"]) if info.has("footage") else None,
@@ -231,7 +233,7 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
     category_of = {track: names.index(species.get(track, "bird")) + 1 for track in observations.track_id.tolist()}
     # one at a time: pycocotools fails for a list of more than 255 masks
     areas = {place: int(coco_mask.area(cast(Any, mask))) for place, mask in masks.items()}
-    scores = cast(np.ndarray, observations.score)
+    scores, origin = cast(np.ndarray, observations.score), cast(np.ndarray, observations.keypoint_origin)
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
         confidence = observations.confidence[n, t]
         hidden = cast(np.ndarray, observations.occluded)[n, t]
@@ -250,6 +252,8 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         }
         if scores[n, t] != 1:
             annotation["score"] = float(_shortest(scores[n, t]))
+        if origin[n, t]:
+            annotation["keypoint_origin"] = KEYPOINT_ORIGINS[origin[n, t]]
         if (n, t) in masks:
             annotation["segmentation"] = _json_rle(masks[n, t])
         if (n, t) in observations.amodal_masks:

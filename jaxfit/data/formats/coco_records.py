@@ -33,6 +33,7 @@ import numpy as np
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.rle import read_segmentation
 from jaxfit.data.masks import MAX_IMAGE_SIDE_PX, box_of_keypoints
+from jaxfit.data.observations import KEYPOINT_ORIGINS
 from jaxfit.data.tracks import frame_numbers
 from jaxfit.foundation.errors import InputError
 
@@ -95,6 +96,8 @@ class Annotation(NamedTuple):
     """Run lengths of the mask of the whole bird, including hidden parts, not checked."""
     score: float
     """Score of the detection of the bird."""
+    origin: int
+    """Position in `KEYPOINT_ORIGINS`."""
 
 
 def read_images(root: Field) -> dict[int | str, Image]:
@@ -235,6 +238,7 @@ def _annotation(
         rle,
         amodal_rle,
         score,
+        KEYPOINT_ORIGINS.index(entry.get("keypoint_origin", "")),
     )
 
 

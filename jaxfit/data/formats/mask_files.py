@@ -76,8 +76,8 @@ def add_masks(
                 if mask.shape != (height, width):
                     problem = f"has masks of {mask.shape[1]}×{mask.shape[0]}, but the image is {width}×{height}"
                     raise InputError(source, problem, "give masks in the size of the images")
-            for bird, mask in _assigned(observations, birds, t, candidates):
-                masks[bird, t] = encode_mask(mask)
+            for bird, j in assign_masks(observations, birds, t, candidates):
+                masks[bird, t] = encode_mask(candidates[j])
             labelled += len(birds)
             report_progress(1, f"{len(masks)} of {labelled} labelled birds have a mask")
     if not given:
@@ -143,10 +143,10 @@ def _images(observations: Observations) -> Iterator[tuple[int, int, list[int]]]:
             yield birds[0], t, birds
 
 
-def _assigned(
+def assign_masks(
     observations: Observations, birds: list[int], t: int, masks: Sequence[np.ndarray]
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield pairs of bird and mask, so that the masks cover as many keypoints of their birds as possible."""
+) -> Iterator[tuple[int, int]]:
+    """Yield pairs of a bird and the position of its mask; the masks cover as many keypoints as possible."""
     covered = np.zeros((len(birds), len(masks)))
     for j, mask in enumerate(masks):
         _, _, *sides = box_of_mask(mask) or (0, 0, 0)
@@ -160,7 +160,7 @@ def _assigned(
             covered[i, j] = hit.sum() / max(confidence.sum(), 1e-6)
     for i, j in zip(*linear_sum_assignment(-covered), strict=True):
         if covered[i, j] >= _COVERED:
-            yield birds[i], masks[j]
+            yield birds[i], int(j)
 
 
 def _image_names(observations: Observations, video: Path | None) -> dict[tuple[int, int], str]:

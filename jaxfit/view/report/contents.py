@@ -93,6 +93,8 @@ class Report:
     facts: Mapping[str, str]
     """Model, networks and versions."""
     corrections: tuple[str, ...]
+    label_problems: tuple[str, ...]
+    """Labels that are left out or contradict each other."""
     config: str
     """The config as YAML."""
     body_lengths: tuple[str, ...]
@@ -204,6 +206,9 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
         facts["length of the model"] = f"{length_cm:.1f} cm from bill to tail, measured by the cameras"
     for kind, files in entries("networks"):
         facts[f"network: {kind}"] = ", ".join(f"{name} ({digest[:12]})" for name, digest in files.items())
+    labels = summary.get("labels") or {}
+    for track, frames in (labels.get("frames") or {}).items():
+        facts[f"poses of track {track}"] = on_what(frames)
     facts |= {name: str(version) for name, version in entries("versions")}
     return {
         "video": video.get("file"),
@@ -216,7 +221,13 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
         "seconds": {name: float(seconds) for name, seconds in entries("seconds")},
         "facts": facts,
         "corrections": tuple(map(str, summary.get("corrections") or ())),
+        "label_problems": tuple(map(str, labels.get("problems") or ())),
     }
+
+
+def on_what(frames: Mapping[str, int]) -> str:
+    """Return on what the poses of a track stand: labels, flow, the outline alone."""
+    return "; ".join(f"{counted(int(count), 'frame')} on {what}" for what, count in frames.items() if count)
 
 
 def _tracks(
@@ -325,6 +336,9 @@ def warnings_of(report: Report) -> list[Warned]:
     if problems:
         text = "Windows of frames whose fit diverged, and frames that were skipped, have no pose."
         warned.append(Warned(counted(len(problems), "problem") + " of the fit", text, problems))
+    if report.label_problems:
+        text = "Correct these labels, or label further frames, and run the command again."
+        warned.append(Warned("Labels that do not fit", text, report.label_problems))
     if report.damaged:
         text = f"{counted(len(report.damaged), 'frame')} of the video could not be decoded: {numbers(report.damaged)}."
         warned.append(Warned("Damaged frames", text))

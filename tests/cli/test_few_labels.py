@@ -1,0 +1,73 @@
+"""`reconstruct --labels --masks` from end to end: labels of one bird in a few frames, masks of all birds."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from support.cli_files import rejected
+from support.toy_footage import BIRD, BIRDS, FRAMES, QUICK, SIDE, Footage
+
+from jaxfit import load_solution, read_coco
+from jaxfit.cli.main import main
+from jaxfit.model.files import save_bird
+
+FOOTAGE, LABELLED = Footage(), (0, 5, 11)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    FOOTAGE.write(folder / "frames")
+    save_bird(BIRD, folder / "toy.npz")
+    (folder / "quick.yaml").write_text(QUICK)
+    (folder / "masks").mkdir()
+    for t, masks in enumerate(FOOTAGE.masks):
+        numbered = [mask.astype(np.uint8) * (n + 1) for n, mask in enumerate(masks)]
+        cv2.imwrite(str(folder / "masks" / f"{t}.png"), np.concatenate(numbered, axis=1))
+    write_labels(folder / "labels.csv", {t: FOOTAGE.keypoints_px[t, 1] for t in LABELLED})
+    return folder
+
+
+def write_labels(path, marked):
+    """Write a table of DeepLabCut."""
+    parts = [name for name in BIRD.keypoint_names for _ in "xy"]
+    rows = [["scorer", *["me"] * len(parts)], ["bodyparts", *parts], ["coords", *"xy" * BIRD.num_keypoints]]
+    rows += [[f"labeled-data/film/img{t:03d}.png", *map(str, points.ravel())] for t, points in marked.items()]
+    path.write_text("\n".join(map(",".join, rows)) + "\n")
+
+
+def command(inputs, out, labels="labels.csv"):
+    options = {"--labels": labels, "--masks": "masks", "--model": "toy.npz", "--config": "quick.yaml"}
+    given = [text for option, name in options.items() for text in (option, str(inputs / name))]
+    return ["reconstruct", str(inputs / "frames"), *given, "--out", str(out)]
+
+
+def test_a_few_labels_and_masks_become_poses(inputs, tmp_path, capsys):
+    out = tmp_path / "result"
+    assert main(command(inputs, out)) == 0
+    frames = {"labels": 3, "flow": FRAMES - 3, "the outline alone": 0}
+    assert "poses of track 2: 3 frames on labels; 9 frames on flow" in capsys.readouterr().out
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["labels"]["used"] == 3
+    assert summary["labels"]["frames"]["2"] == frames
+    assert summary["labels"]["frames"]["1"] == {"labels": 0, "flow": 0, "the outline alone": FRAMES}
+    assert "poses of track 2" in (out / "report.html").read_text()
+    seen = read_coco(out / "observations.json")
+    assert np.flatnonzero(seen.keypoint_origin[1] == 1).tolist() == list(LABELLED)
+    assert seen.num_tracks == BIRDS
+    solution, _ = load_solution(out)
+    assert solution.valid[1].all()
+    error_px = np.linalg.norm(
+        solution.keypoints.px[1, list(LABELLED)] - FOOTAGE.keypoints_px[list(LABELLED), 1], axis=-1
+    )
+    assert np.median(error_px) < 0.1 * SIDE
+
+
+def test_labels_of_another_film(inputs, tmp_path, capsys):
+    write_labels(inputs / "late.csv", {FRAMES + 5: FOOTAGE.keypoints_px[0, 1]})
+    rejected(capsys, command(inputs, tmp_path / "result", "late.csv"), "late.csv", alone=False)
+    write_labels(inputs / "beside.csv", {3: FOOTAGE.keypoints_px[0, 1] * [1, 0] + [0, 1]})
+    reason = "no label belongs to a tracked bird: frame 3: no mask covers"
+    rejected(capsys, command(inputs, tmp_path / "result", "beside.csv"), reason, alone=False)
+    assert not (tmp_path / "result").exists()
