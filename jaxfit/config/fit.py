@@ -201,6 +201,10 @@ class FitConfig:
     """What is learnt from the data before the fit (docs/method/learnt_weights.md): the scale of `keypoint_likelihood`,
     the weight of `mask_smooth_l1`, and `keypoint_offsets`. The values of the config are then the initial values, and
     weak prior knowledge. The result holds the learnt values in `learnt.yaml`."""
+    species_bone_sd: NonNegativeFloat = 0.0
+    """Standard deviation, relative to the rest skeleton, by which the bones of a species differ from those of the
+    model, beside the prior of the model: a published prior knows individuals of one species only, and half of the bones
+    of AVES have one length. 0: the birds are of the species of the model."""
     keypoint_offsets: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     """Keypoint → [x, y, z]: offset of the keypoint in the observations from the keypoint of the model, in the rest
     pose: sideways, towards the bill, upwards; model units. The keypoints of the result have these offsets, too."""

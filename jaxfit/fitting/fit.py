@@ -10,6 +10,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
@@ -331,10 +332,16 @@ def _windows_of_runs(
 
 
 def _fitted_bird(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None) -> Bird:
-    """Return the bird, without its shape directions if no stage and no initial pose uses the directions.
+    """Return the bird with the prior of the config, without shape directions that no stage and no initial pose uses.
 
     Unused shape directions only cost time.
     """
+    if config.species_bone_sd:
+        mirrored = np.eye(bird.num_joints - 1)
+        for left, right in bird.bone_pairs:
+            mirrored[left, right] = mirrored[right, left] = 1
+        widened = np.asarray(bird.bone_covariance, np.float64) + config.species_bone_sd**2 * mirrored
+        bird = replace(bird, bone_covariance=jnp.asarray(widened, jnp.float32))
     if any("betas" in stage.optimised for stage in config.stages):
         return bird
     if initial_poses is not None and initial_poses.has_shape:

@@ -44,6 +44,7 @@ from jaxfit.config.build import with_values
 from jaxfit.config.fit import FitConfig, term_settings
 from jaxfit.config.yaml_file import config_to_yaml, rounded
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
+from jaxfit.fitting.bodies import stages_of_pass
 from jaxfit.fitting.evidence import KEYPOINTS, MASK, Evidence, measure
 from jaxfit.fitting.keypoint_offsets import first_offsets, learn_offsets
 from jaxfit.fitting.solve import FitModel, fit_model
@@ -125,15 +126,16 @@ def learn(
         progress: shows progress.
         source: name of the observations in messages.
     """
-    # the sample is fitted in one pass, with a body for each window
-    one_pass = tuple(replace(stage, share_body=False) for stage in config.stages)
+    # a body for each window: the stage that optimises the bodies is the last, so that their numbers count in γ
+    first_pass = stages_of_pass(config, has_bodies=False)
+    one_pass = tuple(replace(config.stages[i], share_body=False) for i in first_pass)
     first, remarks = replace(config, learn_weights=(), stages=one_pass), []
     some = windows[choose_windows(windows, frames_per_batch(model.bird, config) // config.window)]
     names = _learnable(config, some, remarks)
     values: dict[str, Value] = {}
     if names:
-        steps = config.stages[-1].steps
-        total = sum(stage.steps for stage in config.stages[:-1]) + steps // 2 + (ROUNDS - 1) * (steps // 4)
+        steps = one_pass[-1].steps
+        total = sum(stage.steps for stage in one_pass[:-1]) + steps // 2 + (ROUNDS - 1) * (steps // 4)
         with progress(f"Learning weights from {len(some)} windows", total) as report_progress:
             values = _learn_values(model, first, some, names, report_progress, remarks)
     for remark in remarks:

@@ -26,7 +26,7 @@ from jaxfit.fitting.bodies import (
     estimate_bodies,
 )
 from jaxfit.fitting.error_bars import _with_body
-from jaxfit.fitting.fit import fit, fit_runs
+from jaxfit.fitting.fit import fit, fit_runs, learn_weights, model_of_fit
 from jaxfit.fitting.posterior import BodySensitivity
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
@@ -268,6 +268,27 @@ def test_fit_finds_the_bones_of_each_bird(fitted):
     np.testing.assert_allclose(
         np.nanmean(solution.error_bars.bone_length_sd, axis=1), solution.bodies.bone_length_sd, rtol=1e-3
     )
+
+
+def test_weights_are_learnt_where_the_bodies_are_optimised(fitted):
+    """In the later stages the bodies are known, and their numbers would not count among those that take up errors."""
+    learning = dataclasses.replace(CONFIG, learn_weights=("keypoint_likelihood",))
+    first, shared, _ = stages()
+    one_pass = dataclasses.replace(learning, stages=(first, dataclasses.replace(shared, share_body=False)))
+    found, expected = (learn_weights(fitted[0], BIRD, each).values for each in (learning, one_pass))
+    assert found == expected
+    assert found
+
+
+def test_bones_of_other_species_have_a_wider_prior():
+    widened = model_of_fit(BIRD, dataclasses.replace(CONFIG, species_bone_sd=0.2)).priors.bone_whitener
+    draws = np.random.default_rng(7).standard_normal((3, 400_000)) * 0.2
+    left, right = np.array(BIRD.bone_pairs).T
+    change = np.zeros((BONES, 400_000))
+    change[:] = draws[:BONES]
+    change[right] = change[left]  # a left and a right bone differ from the model alike
+    expected = np.asarray(BIRD.bone_covariance) + np.cov(change)
+    np.testing.assert_allclose(np.linalg.inv(widened.T @ widened), expected, atol=1e-3)
 
 
 def test_bodies_do_not_depend_on_other_birds(fitted):
