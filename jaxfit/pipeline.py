@@ -249,7 +249,7 @@ def reconstruct(
                 tracking = tracking._replace(observations=carried.observations)
         with clock("fit"):
             learnt_yaml = None
-            if config.fit.learn_weights:
+            if config.fit.learns_first:
                 learnt = learn_weights(tracking.observations, bird, config.fit, progress=progress, source=video)
                 config, learnt_yaml = replace(config, fit=learnt.config), learnt.to_yaml()
             fit_progress = annotated(progress, store.state)

@@ -70,7 +70,7 @@ def fit(options: argparse.Namespace) -> None:
     read_s = time.perf_counter() - start
     with open_cluster(options.workers, options.scheduler) as cluster:
         source, learnt = options.observations, None
-        if config.learn_weights:
+        if config.learns_first:
             learnt = learn_weights(observations, bird, config, initial_poses, terminal, source)
             config = learnt.config
         solution = fit(
@@ -107,7 +107,7 @@ def _known_bodies(
     same = same and all(np.array_equal(getattr(own, name), getattr(bird, name)) for name in ("joints", "shape_basis"))
     if not same:
         raise InputError(options.body, f"has the bodies of another model, {own.name}", "give a result of this model")
-    bodies = bodies_of(solution, config)
+    bodies = bodies_of(solution, bird, config)
     has_shapes = any(body.betas.any() for body in bodies.values())
     if has_shapes and "betas" not in config.stages[config.body_stage].optimised:
         problem = "has bodies with a shape, but no stage of the config shares the shape"

@@ -198,9 +198,10 @@ class FitConfig:
     """Whether the result has error bars: standard deviations of the pose and covariances of the keypoints
     (docs/reference/result_folder.md). They assume that the terms of the last stage are negative log-likelihoods."""
     learn_weights: tuple[Learnable, ...] = ()
-    """What is learnt from the data before the fit (docs/method/learnt_weights.md): the scale of `keypoint_likelihood`,
-    the weight of `mask_smooth_l1`, and `keypoint_offsets`. The values of the config are then the initial values, and
-    weak prior knowledge. The result holds the learnt values in `learnt.yaml`."""
+    """What is learnt from the data (docs/method/learnt_weights.md): the scale of `keypoint_likelihood`, the weight of
+    `mask_smooth_l1`, and `keypoint_offsets`. The values of the config are then the initial values, and weak prior
+    knowledge. Scale and offsets alone, with `share_body`, are learnt with the bodies, and the result holds them in
+    `bodies`; otherwise all are learnt before the fit, and the result holds them in `learnt.yaml`."""
     species_bone_sd: NonNegativeFloat = 0.0
     """Standard deviation, relative to the rest skeleton, by which the bones of a species differ from those of the
     model, beside the prior of the model: a published prior knows individuals of one species only, and half of the bones
@@ -232,6 +233,10 @@ class FitConfig:
             require(bool(has_body), at, "is true", "the stage must optimise bone_length or betas")
             later = [stage for stage in self.stages[i + 1 :] if {"bone_length", "betas"} & set(stage.optimised)]
             require(not later, at, "is true", "later stages must not optimise bone_length or betas")
+            free = "betas" in self.stages[i].optimised and "shape_prior" in self.stages[i].terms
+            remedy = f"expected betas and shape_prior in the stage {self.stages[i].name}, which `share_body` is in"
+            offsets = free or self.learns_first or "keypoint_offsets" not in self.learn_weights
+            require(offsets, "learn_weights", 'names "keypoint_offsets"', remedy)
             adam = self.stages[i].solver == "adam" or self.stages[i + 1].carry_moments
             require(not adam, at, "is true", "the stage must use Levenberg-Marquardt")
         for i, stage in enumerate(self.stages):
@@ -244,6 +249,12 @@ class FitConfig:
     def overlap_frames(self) -> int:
         """Number of frames that consecutive windows share: `overlap`, or half of a shorter window."""
         return min(self.overlap, self.window // 2)
+
+    @property
+    def learns_first(self) -> bool:
+        """Whether values are learnt from a sample before the fit, and not with the bodies."""
+        with_bodies = self.body_stage is not None and "mask_smooth_l1" not in self.learn_weights
+        return bool(self.learn_weights) and not with_bodies
 
     @property
     def body_stage(self) -> int | None:

@@ -152,6 +152,10 @@ class Bodies(_Arrays):
     """Number of independent frames that the data of the track are worth."""
     determined: Float32[np.ndarray, "N"]
     """How many of the numbers of the body the data determine; 0: the body is that of the model."""
+    keypoint_scale: Float32[np.ndarray, "N"]
+    """Scale of the keypoint errors, as a multiple of the scale in the config."""
+    keypoint_offsets: Float32[np.ndarray, "N K 3"]
+    """Detected keypoints minus keypoints of the model, in the rest pose, model units: sideways, to the bill, up."""
 
 
 def layout_of(record: type) -> dict[str, tuple[str, Any]]:

@@ -29,6 +29,7 @@ from jaxfit.fitting.solve import (
     shared_parameters,
     stage_hyperparameters,
     stage_program,
+    with_offsets,
 )
 from jaxfit.fitting.tiles import join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.foundation.progress import ReportProgress
@@ -73,6 +74,8 @@ class Batch(NamedTuple):
     """Of each initial pose, from earlier stages; None for the first stage."""
     body_covariance: Float[np.ndarray, "S P P"] | None = None
     """Of the body that each initial pose has (`fitting/bodies.py`); None without given bodies."""
+    keypoint_scale: Float[np.ndarray, "S"] | None = None
+    """Of the keypoint errors of the track, as a multiple of the scale in the config; None without given bodies."""
 
 
 class FittedWindow(NamedTuple):
@@ -116,6 +119,7 @@ def fit_batch(
     last = stages[-1]
     count, hypotheses, frames = initial.global_orient.shape[:3]
     pose = jax.tree.map(lambda x: np.asarray(x).reshape(count * hypotheses, *x.shape[2:]), initial)
+    pose = with_offsets(model, pose)
     failure, ambiguity_deg = np.full(len(pose.transl), "", object), np.zeros((len(pose.transl), frames), np.float32)
     if batch.ambiguity_deg is not None:
         ambiguity_deg = np.repeat(batch.ambiguity_deg, hypotheses, axis=0)
@@ -156,8 +160,9 @@ def fit_batch(
             used, hyperparameters = own[0], [stage_hyperparameters(*pair, model.bird.keypoint_names) for pair in pairs]
         run = _stage_run(used, with_shared(program, used), rows, hyperparameters, batch, first)
         bars = _error_bars(run, rows, configs[0].common_size, covariance)
+    pose = replace(rows.pose, betas=rows.pose.betas[:, : len(model.rig.shape_basis)])
     fitted = FittedWindow(
-        rows.pose, final.loss, final.keypoints_cam, final.keypoints_px, rows.failure, rows.ambiguity_deg, bars, body
+        pose, final.loss, final.keypoints_cam, final.keypoints_px, rows.failure, rows.ambiguity_deg, bars, body
     )
     return jax.tree.map(lambda x: x[rows.row], fitted)
 
@@ -189,14 +194,20 @@ def _stage_run(
     targets = batch.targets
     if not needs_mask(stage):
         targets = replace(targets, mask=targets.mask[..., :0, :0])
-    config, targets_row = (np.repeat(values[first], rows.count) for values in (batch.config, batch.targets_row))
+    config, targets_row, problem = (
+        np.repeat(values[first], rows.count) for values in (batch.config, batch.targets_row, batch.pose_row)
+    )
     run = _StageRun(stage, program, [], len(rows.failure))
     for tile in tile_rows(run.count, tile_size(rows.ambiguity_deg.shape[1])):
         seen = take_tile(targets, targets_row[tile])
         # without masks, the problems that fill up the last tile render no silhouettes
         real = (tile >= 0).reshape(-1, *(1,) * (seen.has_mask.ndim - 1))
         seen = replace(seen, has_mask=seen.has_mask & real)
-        settings = jax.device_put(jax.tree.map(lambda *x: np.stack(x), *(hyperparameters[c] for c in config[tile])))
+        settings = jax.tree.map(lambda *x: np.stack(x), *(hyperparameters[c] for c in config[tile]))
+        if batch.keypoint_scale is not None and "keypoint_likelihood" in settings.settings:
+            own, factor = settings.settings["keypoint_likelihood"], batch.keypoint_scale[problem[tile]]
+            own |= {name: own[name] * factor for name in ("sd_sure_px", "sd_unsure_px")}
+        settings = jax.device_put(settings)
         run.tiles.append((Problem(settings, take_tile(rows.pose, tile), seen), tile))
     return run
 

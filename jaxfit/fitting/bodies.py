@@ -7,8 +7,9 @@ of the prior with the mean μ, and m the optimum. The data of the window then sa
     I = A − P,   s = (A − Q)·(m − μ),
 
 information and score about b − μ. Q is the precision of the broad prior, which A and P contain, and the optimum does
-not. The score is s = I·(b − μ) plus noise, with the covariance N = I/κ + M of two parts that the fit does not assume:
+not. The score is s = I·(b − μ) plus noise, with the covariance N = f·I/κ + M of parts that the fit does not assume:
 
+- Errors that are larger than the config says: f is the misfit factor of the track (`fitting/error_bars.py`).
 - Errors that agree between frames. A keypoint that lies 1 % too low in one frame lies too low in the next frame. A body
   that all frames share takes up such errors, and free bones then make the poses worse. So n frames count as n_eff = κ·n
   frames only, with
@@ -19,7 +20,7 @@ not. The score is s = I·(b − μ) plus noise, with the covariance N = I/κ + M
   errors, n_eff is the number of frames; for errors that do not change, n_eff is 1. Errors longer than `LONGEST` times
   the median length of a window are shortened to this length.
 - A posture that lasts. The pose prior counts the frames of a window as independent draws, but a bird hardly changes its
-  posture. M = A·VVᵀ·A, with the covariance VVᵀ of `sandwich.constant_deviation` for the body.
+  posture. M = U·Uᵀ, U = A·V, with the deviation V of `sandwich.constant_deviation` for the body.
 
 The windows of a track are added, and the body is the mean of
 
@@ -32,6 +33,11 @@ the prior, the body of a species differs from μ by m ~ N(0, (1 − d)·C), and 
 one share d for bones and one for shape. The bodies are the means of their joint posterior, and d has the largest
 marginal likelihood on a grid. So d = 1 if birds of one species differ as much as any birds, and the bodies then do not
 depend on each other; d is near 0 if all tracks have one body. A track alone has the prior N(0, C) for every d.
+
+Keypoints of a detector lie beside those of the model (`keypoint_offsets`): these offsets are further shape coefficients
+of the fit, which move no vertex, so that I and s are about bodies and offsets. All tracks have the same offsets, with a
+prior whose width has the largest marginal likelihood on a grid. For the offsets, a share of the posture that lasts is
+common to all tracks (`COMMON_POSTURE`): s = I·x + U·v + noise, with one v for all tracks.
 
 A second fit with fixed bodies follows, so that no window has a body of its own: the poses of a window would otherwise
 fit a body that the other windows contradict.
@@ -56,13 +62,15 @@ from scipy.stats import chi2
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.solution import Solution
+from jaxfit.fitting.error_bars import window_misfits
+from jaxfit.fitting.keypoint_offsets import longest_distance, offset_directions
 from jaxfit.fitting.posterior import BROAD_BONE_SD, BROAD_SHAPE_SD, window_posteriors
 from jaxfit.fitting.problem import Problem, Program
 from jaxfit.fitting.sandwich import constant_deviation
-from jaxfit.fitting.solve import shared_parameters
+from jaxfit.fitting.solve import FitModel, learns_offsets, shared_parameters
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose
-from jaxfit.objective.posed_window import priors_of
+from jaxfit.objective.posed_window import Priors
 
 _logger = logging.getLogger(__name__)
 
@@ -71,9 +79,15 @@ ASYMMETRY_SD = 0.01
 LONGEST = 3.0
 """Largest length of an error, in units of the median of its window: outliers do not decide n_eff."""
 
+COMMON_POSTURE = 0.5
+"""Share of the variance of a lasting posture that all birds of a film have in common, for the offsets of keypoints:
+birds of one film do the same in the same place, and nothing says how much."""
 DIFFERENT, MIN_VARIANCE = 1e-4, 1e-3
 """Two halves of a track disagree where one body explains their difference with a smaller probability. Directions whose
 difference has a smaller variance, in units of the prior, do not count."""
+
+WIDTHS = 0.1, 0.2, 0.4, 0.7, 1.0, 2.0
+"""Grid of the width of the prior of the offsets, in units of `keypoint_offsets.PRIOR_SHARE`."""
 
 SHARES = 0.01, 0.03, 0.1, 0.2, 0.4, 0.7, 1.0
 """Grid of the shares d."""
@@ -86,14 +100,17 @@ class BodyEvidence(NamedTuple):
     """m: the optimised bone lengths and shape coefficients."""
     precision: Float[np.ndarray, "*B P P"]
     """A; NaN for a window without a posterior."""
-    posture: Float[np.ndarray, "*B P P"]
-    """M: covariance of the score from a posture that differs from the mean of the prior in the whole window."""
+    posture: Float[np.ndarray, "*B P D"]
+    """U: change of the score by a posture that differs from the mean of the prior in the whole window, in units of the
+    prior."""
     error_sum: Float[np.ndarray, "*B K 2"]
     """Sum over the frames of the errors of each keypoint, crop pixels, shortened."""
     error_squares: Float[np.ndarray, "*B K"]
     """Sum of their squared lengths."""
     errors: Float[np.ndarray, "*B K"]
     """Their number."""
+    misfit: Float[np.ndarray, "*B"]
+    """Misfit factor of the keypoint errors (`fitting/error_bars.py`)."""
 
 
 class Body(NamedTuple):
@@ -102,12 +119,16 @@ class Body(NamedTuple):
     bone_length: Float[np.ndarray, "bones"]
     """Relative to the rest skeleton."""
     betas: Float[np.ndarray, "S"]
+    offsets: Float[np.ndarray, "D"]
+    """Of the keypoints, along `keypoint_offsets.offset_directions`, equal for all birds; D is 0 for fixed offsets."""
     covariance: Float[np.ndarray, "P P"]
-    """Σ of the numbers that the stage optimises: bone lengths, then shape coefficients."""
+    """Σ of the numbers that the stage optimises: bone lengths, shape coefficients, offsets."""
     frames: float
     """n_eff: the number of independent frames that the data of the track are worth."""
     determined: float
     """Number of determined numbers, P − tr(Σ·P₀) with the precision P₀ of the prior: 0 if the body is the prior's."""
+    keypoint_scale: float = 1.0
+    """Scale of the keypoint errors of the track, as a multiple of the scale in the config."""
     agree: bool = True
     """Whether the first and the second half of the windows agree about the body; they disagree for two birds."""
 
@@ -138,20 +159,21 @@ def body_evidence(
     """
     fitted_px = np.asarray(keypoints_px, np.float64)
     found, reasons = [], []
-    for b, posterior in enumerate(window_posteriors(program, problems, pose)):
+    posteriors = window_posteriors(program, problems, pose)
+    misfits = window_misfits(program, problems, pose, posteriors)
+    for b, posterior in enumerate(posteriors):
         values = [np.asarray(getattr(pose, name)[b], np.float64) for name in program.shared]
         mean = np.concatenate(values)
-        precision = posture = np.full((len(mean), len(mean)), np.nan)
+        whitener = np.asarray(program.priors.pose_whitener, np.float64)
+        precision, posture = np.full((len(mean), len(mean)), np.nan), np.zeros((len(mean), len(whitener)))
         if not isinstance(posterior, str):
             # the inverse of the block of H⁻¹ integrates the poses and the size out; the body is its last columns
             precision = np.linalg.inv(_last_block(posterior.factors.corner, len(mean)))
-            posture = np.zeros_like(precision)
             if "pose_prior" in program.terms:
                 weight = float(problems.hyperparameters.settings["pose_prior"]["weight"][b])
-                whitener = np.asarray(program.priors.pose_whitener, np.float64)
                 present = np.asarray(problems.targets.present[b], bool)
-                of_frames = constant_deviation(posterior, whitener, 3, weight, present)
-                posture = precision @ _last_block(of_frames[0], len(mean)) @ precision
+                _, shared = constant_deviation(posterior, whitener, 3, weight, present)
+                posture = precision @ shared[len(shared) - len(mean) :]
         targets = problems.targets
         seen = np.asarray(targets.confidence[b] > 0) & np.asarray(targets.present[b])[:, None]
         on = np.asarray(problems.hyperparameters.keypoints_on[b])
@@ -161,7 +183,7 @@ def body_evidence(
         longest = LONGEST * np.median(length[seen]) if seen.any() else 0.0
         error = error * np.minimum(1, longest / np.maximum(length, 1e-9))[..., None]
         counts = error.sum(0), (error**2).sum((0, 2)), seen.sum(0).astype(float)
-        found.append(BodyEvidence(mean, precision, posture, *counts))
+        found.append(BodyEvidence(mean, precision, posture, *counts, misfits[b]))
         reasons.append(posterior if isinstance(posterior, str) else "")
     return found, reasons
 
@@ -175,7 +197,7 @@ def _last_block(matrix: Float[np.ndarray, "n n"], size: int) -> Float[np.ndarray
 def estimate_bodies(
     track: Int[np.ndarray, "W"],
     evidence: Sequence[BodyEvidence | None],
-    bird: Bird,
+    model: FitModel,
     config: FitConfig,
     species: Int[np.ndarray, "N"] | None = None,
 ) -> dict[int, Body]:
@@ -184,96 +206,137 @@ def estimate_bodies(
     Args:
         track: the position of the track of each window.
         evidence: of each window; None for a window that failed.
-        bird: the model.
+        model: the model of the fit.
         config: the config, whose shared stage has the weights of the priors.
         species: number of the species of each track; None for one species.
     """
-    names = _body_numbers(config)
-    mean, precision, broad = _prior(bird, config)
-    prior = _symmetric(precision, bird) if "bone_length" in names else precision
+    bird, names = model.bird, _body_numbers(config)
+    mean, precision, broad = _prior(model.priors, config)
+    offsets = len(model.rig.keypoint_shape_map) - len(model.rig.shape_basis)
+    P, common_posture = len(mean), COMMON_POSTURE if offsets else 0.0
+    postures = 3 * (bird.num_joints - 1) if offsets else 0
+    # the numbers of a body, the offsets, and the posture that all birds have in common
+    of_numbers = _symmetric(precision, bird) if "bone_length" in names else precision
+    prior = np.asarray(block_diag(of_numbers, np.eye(postures)))
     usable = [w for w, each in enumerate(evidence) if each is not None and np.isfinite(each.precision).all()]
 
-    def of_data(own: Sequence[BodyEvidence]) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return ΣI·N⁻¹·I and ΣI·N⁻¹·s of some windows, and n_eff."""
+    def of_data(own: Sequence[BodyEvidence], misfit: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return ΣGᵀN⁻¹G and ΣGᵀN⁻¹s of some windows, with G = [I, U], and n_eff."""
         frames = sum(each.errors.max(initial=0) for each in own)
         counted = min(1 / max(_common_share(own), 1e-9), frames) if own else 0.0
-        kappa, information, score = counted / max(frames, 1.0), np.zeros_like(precision), np.zeros_like(mean)
+        kappa, information, score = counted / max(frames, 1.0), np.zeros_like(prior), np.zeros(len(prior))
         for each in own if kappa else ():
             # rounding and ridges may leave slightly negative directions, which say nothing
             values, vectors = np.linalg.eigh((each.precision + each.precision.T) / 2 - precision)
             own_information = (vectors * np.maximum(values, 0)) @ vectors.T
             # the noise of the score; the small part of the prior keeps directions without data finite
-            noise = own_information / kappa + each.posture + 1e-9 * precision
-            gain = np.linalg.solve(noise, own_information).T
-            information += gain @ own_information
+            posture = (1 - common_posture) * each.posture @ each.posture.T
+            noise = own_information * misfit / kappa + posture + 1e-9 * precision
+            G = np.concatenate([own_information, common_posture**0.5 * each.posture[:, :postures]], axis=1)
+            gain = np.linalg.solve(noise, G).T
+            information += gain @ G
             score += gain @ (each.precision - broad) @ (each.mean - mean)
-        return information, score, counted
+        return (information + information.T) / 2, score, counted
 
-    def posterior(information: np.ndarray, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def alone(own: Sequence[BodyEvidence], misfit: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and covariance of a body and of the offsets, from some windows of one track."""
+        information, score, _ = of_data(own, misfit)
         covariance = np.linalg.inv(prior + information)
-        return covariance @ score, (covariance + covariance.T) / 2
+        return (covariance @ score)[:P], covariance[:P, :P]
 
     tracks = np.unique(track)
     own = [[cast(BodyEvidence, evidence[w]) for w in usable if track[w] == n] for n in tracks]
-    information, score, counted = zip(*map(of_data, own), strict=True)
+    misfits = [float(np.median([each.misfit for each in windows])) if windows else 1.0 for windows in own]
+    information, score, counted = zip(*map(of_data, own, misfits), strict=True)
+    is_bone = np.arange(P - offsets) < ("bone_length" in names) * (bird.num_joints - 1)
+    group = None
     if config.stages[cast(int, config.body_stage)].share_body == "species":
-        is_bone = np.arange(len(mean)) < ("bone_length" in names) * (bird.num_joints - 1)
         group = np.zeros(len(tracks), int) if species is None else species[tracks]
-        found = _of_species(np.stack(information), np.stack(score), group, prior, is_bone)
-    else:
-        found = [posterior(*each) for each in zip(information, score, strict=True)]
+    found = _of_tracks(np.stack(information), np.stack(score), group, prior, is_bone, offsets)
+    if offsets:
+        shift = np.tensordot(found[0][0][P - offsets : P], offset_directions(bird), axes=1)
+        share = np.sqrt((shift**2).sum(1).mean()) / longest_distance(bird)
+        _logger.info("the keypoints lie %.1f %% of the length of the bird beside those of the model (RMS)", 100 * share)
     bodies = {}
     of_model = np.asarray(bird.bone_mean, np.float32), np.zeros(bird.num_shapes, np.float32)
-    for n, windows, (change, covariance), frames in zip(tracks.tolist(), own, found, counted, strict=True):
-        determined = len(mean) - float(np.trace(covariance @ prior))
-        halves = windows[: len(windows) // 2], windows[len(windows) // 2 :]
-        agree = not halves[0] or _agree(*(posterior(*of_data(half)[:2]) for half in halves), prior)
-        bodies[n] = Body(*_split(mean + change, names, *of_model), covariance, frames, determined, agree)
+    for i, (n, (change, covariance)) in enumerate(zip(tracks.tolist(), found, strict=True)):
+        at, numbers = slice(P - offsets), mean + change[:P]
+        determined = P - offsets - float(np.trace(covariance[at, at] @ prior[at, at]))
+        halves = own[i][: len(own[i]) // 2], own[i][len(own[i]) // 2 :]
+        first, second = (alone(half, misfits[i]) for half in halves)
+        agree = not halves[0] or _agree(first, second, prior[:P, :P])
+        scale = misfits[i] ** 0.5 if "keypoint_likelihood" in config.learn_weights else 1.0
+        parts = *_split(numbers[at], names, *of_model), numbers[P - offsets :].astype(np.float32)
+        bodies[n] = Body(*parts, covariance[:P, :P], counted[i], determined, scale, agree)
     return bodies
 
 
-def _of_species(
-    information: Float[np.ndarray, "N P P"],
-    score: Float[np.ndarray, "N P"],
-    species: Int[np.ndarray, "N"],
-    prior: Float[np.ndarray, "P P"],
+def _of_tracks(
+    information: Float[np.ndarray, "N Q Q"],
+    score: Float[np.ndarray, "N Q"],
+    species: Int[np.ndarray, "N"] | None,
+    prior: Float[np.ndarray, "Q Q"],
     is_bone: Bool[np.ndarray, "P"],
+    offsets: int,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return mean and covariance of the difference from the model for the body of each track.
+    """Return mean and covariance of x of each track: the difference of its body from the model, P numbers, and then c,
+    numbers that all tracks have in common.
 
     Args:
-        information, score: what the data of each track say about its difference x from the model: −½xᵀGx + hᵀx.
-        species: of each track.
+        information, score: what the data of each track say about x: −½xᵀGx + hᵀx.
+        species: of each track; None for bodies that do not depend on each other.
         prior: precision of x.
-        is_bone: which numbers are bone lengths; the others are shape coefficients.
+        is_bone: which numbers of a body are bone lengths; the others are shape coefficients.
+        offsets: how many of the first numbers of c are offsets, whose prior has the most likely width of `WIDTHS`.
     """
-    # in units of the prior, C = I
-    unit = np.linalg.inv(np.linalg.cholesky(prior))
-    G, h = unit @ information @ unit.T, score @ unit.T
-    member = species == np.unique(species)[:, None]
-    one = np.eye(len(prior))
+    b, c = slice(len(is_bone)), slice(len(is_bone), None)
+    # in units of the prior of a body, C = I
+    unit = np.linalg.inv(np.linalg.cholesky(prior[b, b]))
+    G, h, B = unit @ information[:, b, b] @ unit.T, score[:, b] @ unit.T, unit @ information[:, b, c]
+    members = [np.arange(len(score))] if species is None else [species == each for each in np.unique(species)]
+    one = np.eye(len(is_bone))
 
-    def joint(shares: tuple[float, float]) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return the marginal log-likelihood of the shares, and means and covariances of all tracks."""
+    def joint(shares: tuple[float, float], width: float) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the marginal log-likelihood of the shares and the width, and means and covariances of all tracks."""
+        prior_c = prior[c, c].copy()
+        prior_c[range(offsets), range(offsets)] /= width**2
         d = np.where(is_bone, *shares)
-        # given m, x has the mean V·h + K·m and the covariance V; the data then say −½mᵀGK·m + (Kᵀh)ᵀm about m
+        # given m and c, x has the mean V·(h − B·c) + K·m and the covariance V; the data say −½mᵀGK·m + (Kᵀ(h − B·c))ᵀm
         K = np.linalg.inv(one + d[:, None] * G)
-        V, GK, Kh = K * d, G @ K, np.einsum("nba,nb->na", K, h)
+        V, GK, Kt = K * d, G @ K, K.swapaxes(1, 2)
+        Kh, KB = np.einsum("nab,nb->na", Kt, h), Kt @ B
         likelihood = np.einsum("na,nab,nb->", h, V, h) + np.linalg.slogdet(K)[1].sum()
-        mean, covariance = np.zeros_like(h), np.zeros_like(G)
-        for some in member:
+        mean, covariance, slope = np.einsum("nab,nb->na", V, h), V.copy(), -V @ B
+        of_c, right_c = prior_c + information[:, c, c].sum(0), score[:, c].sum(0)
+        of_c += (B.swapaxes(1, 2) @ slope).sum(0)
+        right_c -= np.einsum("nac,na->c", B, mean)
+        for some in members:
             precision = one + (1 - d)[:, None] * GK[some].sum(0)
-            S, right = np.linalg.inv(precision) * (1 - d), Kh[some].sum(0)
+            S, right, by_c = np.linalg.inv(precision) * (1 - d), Kh[some].sum(0), KB[some].sum(0)
             likelihood += right @ S @ right - np.linalg.slogdet(precision)[1]
-            mean[some], covariance[some] = K[some] @ (S @ right), K[some] @ S @ K[some].swapaxes(1, 2)
-        return likelihood / 2, mean + np.einsum("nab,nb->na", V, h), covariance + V
+            mean[some] += K[some] @ (S @ right)
+            covariance[some] += K[some] @ S @ Kt[some]
+            slope[some] -= K[some] @ (S @ by_c)
+            of_c -= by_c.T @ S @ by_c
+            right_c -= by_c.T @ S @ right
+        covariance_c = np.linalg.inv(of_c)
+        mean_c, cross = covariance_c @ right_c, slope @ covariance_c
+        likelihood += right_c @ mean_c - np.linalg.slogdet(of_c)[1] + np.linalg.slogdet(prior_c)[1]
+        every = len(score)
+        mean = np.concatenate([mean + slope @ mean_c, np.tile(mean_c, (every, 1))], axis=1)
+        below = np.concatenate([cross.swapaxes(1, 2), np.tile(covariance_c, (every, 1, 1))], axis=2)
+        covariance = np.concatenate([covariance + cross @ slope.swapaxes(1, 2), cross], axis=2)
+        return likelihood / 2, mean, np.concatenate([covariance, below], axis=1)
 
-    shares = max(product(SHARES, SHARES), key=lambda each: joint(each)[0])
-    text = "birds of one species differ by %.0f %% of the variance of the prior in bones, and by %.0f %% in shape"
-    _logger.info(text, *(100 * share for share in shares))
-    _, mean, covariance = joint(shares)
-    covariance = unit.T @ covariance @ unit
-    return list(zip(mean @ unit, (covariance + covariance.swapaxes(1, 2)) / 2, strict=True))
+    all_shares = [(1.0, 1.0)] if species is None else product(SHARES, SHARES)
+    shares, width = max(product(all_shares, WIDTHS if offsets else [1.0]), key=lambda each: joint(*each)[0])
+    if species is not None:
+        text = "birds of one species differ by %.0f %% of the variance of the prior in bones, and by %.0f %% in shape"
+        _logger.info(text, *(100 * share for share in shares))
+    _, mean, covariance = joint(shares, width)
+    whole = block_diag(unit, np.eye(len(prior) - len(unit)))
+    covariance = whole.T @ covariance @ whole
+    return list(zip(mean @ whole, (covariance + covariance.swapaxes(1, 2)) / 2, strict=True))
 
 
 def _agree(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray], prior: Float[np.ndarray, "P P"]) -> bool:
@@ -292,13 +355,12 @@ def _agree(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray], p
     return bool(chi2.sf(squared, max(int(known.sum()), 1)) >= DIFFERENT)
 
 
-def _prior(bird: Bird, config: FitConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _prior(priors: Priors, config: FitConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return mean and precision of the prior of the numbers of a body, and the part of the broad prior.
 
     The posterior of a window contains the broad prior (`posterior.broad_precision`), but the fit does not.
     """
     settings = config.stage_settings(config.stages[stages_of_pass(config, has_bodies=False)[-1]])
-    priors = priors_of(bird)
     whitener, shape_sd = (np.asarray(each, np.float64) for each in (priors.bone_whitener, priors.shape_sd))
     # a term w·‖W(b − μ)‖² in nats has the precision 2w·WᵀW
     of = {
@@ -360,18 +422,24 @@ def with_bodies(
         _logger.warning("%s: track %d: %s", source, track, text)
     bones, shapes = bird.num_joints - 1, bird.num_shapes
     sizes = {"bone_length": bones, "bone_length_sd": bones, "betas": shapes, "betas_sd": shapes}
-    arrays = {name: np.full((birds, size), np.nan, np.float32) for name, size in sizes.items()}
-    arrays |= {name: np.full(birds, np.nan, np.float32) for name in ("frames", "determined")}
+    arrays: dict[str, np.ndarray] = {name: np.full((birds, size), np.nan, np.float32) for name, size in sizes.items()}
+    directions = offset_directions(bird)
+    arrays["keypoint_offsets"] = np.full((birds, bird.num_keypoints, 3), np.nan, np.float32)
+    arrays |= {name: np.full(birds, np.nan, np.float32) for name in ("frames", "determined", "keypoint_scale")}
     for n, body in bodies.items():
         arrays["bone_length"][n], arrays["betas"][n, : len(body.betas)] = body.bone_length, body.betas
         arrays["betas"][n, len(body.betas) :] = 0  # for a fit without shape coefficients
-        arrays["frames"][n], arrays["determined"][n] = body.frames, body.determined
-        sd = _split(np.sqrt(np.diagonal(body.covariance)), _body_numbers(config), np.zeros(bones), np.zeros(shapes))
+        for name in ("frames", "determined", "keypoint_scale"):
+            arrays[name][n] = getattr(body, name)
+        offsets = body.offsets if len(body.offsets) else np.zeros(len(directions))
+        arrays["keypoint_offsets"][n] = np.tensordot(offsets, directions, axes=1)
+        sd = np.sqrt(np.diagonal(body.covariance))[: len(body.covariance) - len(body.offsets)]
+        sd = _split(sd, _body_numbers(config), np.zeros(bones), np.zeros(shapes))
         arrays["bone_length_sd"][n], arrays["betas_sd"][n] = sd
     return solution.with_arrays(**{f"body_{name}": array for name, array in arrays.items()}, failures=failures)
 
 
-def bodies_of(solution: Solution, config: FitConfig) -> dict[int, Body]:
+def bodies_of(solution: Solution, bird: Bird, config: FitConfig) -> dict[int, Body]:
     """Return track id → body of a result; empty for a result without bodies.
 
     The covariances of a result are diagonal: it holds standard deviations.
@@ -379,11 +447,19 @@ def bodies_of(solution: Solution, config: FitConfig) -> dict[int, Body]:
     known, names, found = solution.bodies, _body_numbers(config), {}
     if known is None or not names:
         return {}
+    directions = offset_directions(bird) if learns_offsets(config) else np.zeros((0, bird.num_keypoints, 3))
+    of_directions = directions.reshape(len(directions), 3 * bird.num_keypoints).T
     for n in np.flatnonzero(np.isfinite(known.frames)).tolist():
-        sd = np.concatenate([getattr(known, f"{name}_sd")[n] for name in names]).astype(np.float64)
-        numbers = known.bone_length[n], known.betas[n]
+        sd = np.concatenate([getattr(known, f"{name}_sd")[n] for name in names] + [np.zeros(len(directions))])
+        offsets = np.linalg.lstsq(of_directions, known.keypoint_offsets[n].ravel())[0]
         found[int(solution.track_id[n])] = Body(
-            *numbers, np.diag(sd**2), float(known.frames[n]), float(known.determined[n])
+            known.bone_length[n],
+            known.betas[n],
+            offsets.astype(np.float32),
+            np.diag(sd.astype(np.float64) ** 2),
+            float(known.frames[n]),
+            float(known.determined[n]),
+            float(known.keypoint_scale[n]),
         )
     return found
 

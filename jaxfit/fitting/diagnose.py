@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Int
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.fitting.problem import Problem, Program, problem_window
-from jaxfit.fitting.solve import FitModel, needs_mask, stage_hyperparameters, stage_program
+from jaxfit.fitting.solve import FitModel, needs_mask, stage_hyperparameters, stage_program, with_offsets
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.kinematics import Pose, rest_pose
 from jaxfit.objective.objective import evaluate_curvature, sum_with_blocks, weighted_sum
@@ -32,7 +32,7 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
             term.
     """
     T, K = config.window, model.bird.num_keypoints
-    pose = rest_pose(model.bird, T, config.common_size)
+    pose = with_offsets(model, rest_pose(model.bird, T, config.common_size))
     checked: set[str] = set()
     for stage in config.stages:
         side = config.crop.size_px if needs_mask(stage) else 0

@@ -30,13 +30,14 @@ The error bars are those of the reported pose. Where a second pose explains the 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxfit.data.solution import ERROR_BARS
 from jaxfit.fitting.posterior import BodySensitivity, Posterior, window_posteriors
@@ -171,7 +172,7 @@ def window_error_bars(
     for b, posterior in enumerate(posteriors):
         one, problem, own = jax.tree.map(lambda x, b=b: x[b], (pose, problems, keypoints))
         if isinstance(posterior, str):
-            sizes = one.body_pose.shape[1], len(one.betas), own.points_cam.shape[1]
+            sizes = one.body_pose.shape[1], len(program.rig.shape_basis), own.points_cam.shape[1]
             bars.append(no_error_bars(len(one.transl), *sizes))
             reasons.append(posterior)
             continue
@@ -216,13 +217,15 @@ def _error_bars(
     """Return the error bars of one window."""
     T, _, _, D = keypoints.derivative.shape
     columns = np.concatenate([window.columns.own, window.columns.shared])
-    bones, shapes = pose.body_pose.shape[1], len(pose.betas)
+    bones, shapes = pose.body_pose.shape[1], len(program.rig.shape_basis)
     points, by_cam = np.asarray(keypoints.points_cam, np.float64), np.array(keypoints.derivative, np.float64)
     points_px, by_px = _in_views(program, problem, points, by_cam[..., columns])
     covariance, misfit = _covariance(program, problem, window, points_px, by_px)
     if window.body is not None and body_covariance is not None:
         covariance = _with_body(covariance, window.body, body_covariance)
         columns = np.concatenate([columns, window.body.columns])
+        # the keypoints of the result are without the offsets, the last shape coefficients
+        by_cam[..., D - (len(pose.betas) - shapes if "betas" in program.shared else 0) :] = 0
         by_px = _in_views(program, problem, points, by_cam[..., columns])[1]
     by_transl, scale = np.zeros((T, 3, D)), np.broadcast_to(pose.scale, T).astype(np.float64)
     by_transl[:, :, 3 * bones + 3 : 3 * bones + 6] = np.eye(3)
@@ -238,7 +241,8 @@ def _error_bars(
 
     variance = np.zeros((T, D))  # fixed parameters have none
     variance[:, columns] = np.einsum("tii->ti", covariance)
-    ends = np.cumsum([at_scale + 1, *(bones if name == "bone_length" else shapes for name in program.shared)])
+    numbers = {"bone_length": bones, "betas": len(pose.betas)}
+    ends = np.cumsum([at_scale + 1, *(numbers[name] for name in program.shared)])
     shared_variance = {name: variance[:, a:b] for name, a, b in zip(program.shared, ends[:-1], ends[1:], strict=True)}
     angles_sd = _tangent_sd(pose, columns, covariance)
     transl_cov = _propagate(by_transl[:, None][..., columns], covariance)[:, 0]
@@ -248,7 +252,7 @@ def _error_bars(
         transl_sd=np.einsum("tii->ti", transl_cov),
         scale_sd=np.zeros(T) if common_size else variance[:, at_scale],
         bone_length_sd=shared_variance.get("bone_length", np.zeros((T, bones))),
-        betas_sd=shared_variance.get("betas", np.zeros((T, shapes))),
+        betas_sd=shared_variance.get("betas", np.zeros((T, shapes)))[:, :shapes],
         keypoints_cam_cov=_propagate(by_cam[..., columns], covariance),
         keypoints_centred_cov=_propagate((by_cam - by_cam.mean(axis=1, keepdims=True))[..., columns], covariance),
         keypoints_px_cov=_propagate(by_px[:, : points.shape[1]], covariance),  # of the first view
@@ -379,8 +383,7 @@ def _covariance(
     present = np.asarray(problem.targets.present, bool)
     noise = _noise(problem)
     if noise is not None:
-        error_px = keypoints_px - np.asarray(problem.targets.keypoints_px, np.float64)
-        counted = (noise.confidence > 0) & present[:, None]
+        error_px, counted = _errors(problem, noise, keypoints_px)
         misfit = _misfit(noise, error_px, counted, _propagate(J, covariance))
         factor = time_factor(lag_correlations(error_px, counted), fit_correlation(J, window.covariance, present))
         if factor > 1:
@@ -390,8 +393,42 @@ def _covariance(
     covariance = misfit * covariance
     if prior is not None:
         whitener = np.asarray(program.priors.pose_whitener, np.float64)
-        covariance = covariance + constant_deviation(window, whitener, 3, float(prior["weight"]), present)
+        own, shared = constant_deviation(window, whitener, 3, float(prior["weight"]), present)
+        V = np.concatenate([own, np.broadcast_to(shared, (len(own), *shared.shape))], axis=1)
+        covariance = covariance + V @ V.swapaxes(1, 2)
     return covariance, misfit
+
+
+def window_misfits(
+    program: Program, problems: Problem, pose: Pose, posteriors: Sequence[Posterior | str]
+) -> Float[np.ndarray, "B"]:
+    """Return the misfit factor of each of B problems at their fitted poses; 1 for a problem without a posterior.
+
+    Args:
+        program, problems, pose: as for `window_error_bars`.
+        posteriors: of the problems (`posterior.window_posteriors`).
+    """
+    keypoints = jax.tree.map(np.asarray, _keypoints_and_derivatives(program, problems, pose))
+    problems, factors = jax.tree.map(np.asarray, problems), np.ones(len(posteriors))
+    for b, posterior in enumerate(posteriors):
+        problem, own = jax.tree.map(lambda x, b=b: x[b], (problems, keypoints))
+        noise = _noise(problem)
+        if noise is None or isinstance(posterior, str):
+            continue
+        columns = np.concatenate([posterior.columns.own, posterior.columns.shared])
+        points, slope = (np.asarray(each, np.float64) for each in (own.points_cam, own.derivative[..., columns]))
+        points_px, J = _in_views(program, problem, points, slope)
+        px_cov = _propagate(J, posterior.covariance.of_frames())
+        factors[b] = _misfit(noise, *_errors(problem, noise, points_px), px_cov)
+    return factors
+
+
+def _errors(
+    problem: Problem, noise: _Noise, keypoints_px: Float[np.ndarray, "T K 2"]
+) -> tuple[Float[np.ndarray, "T K 2"], Bool[np.ndarray, "T K"]]:
+    """Return the errors of fitted keypoints, crop pixels, and which of them count."""
+    error_px = keypoints_px - np.asarray(problem.targets.keypoints_px, np.float64)
+    return error_px, (noise.confidence > 0) & np.asarray(problem.targets.present, bool)[:, None]
 
 
 def _misfit(noise: _Noise, error_px: np.ndarray, counted: np.ndarray, px_cov: np.ndarray) -> float:

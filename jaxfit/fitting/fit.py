@@ -116,7 +116,7 @@ def fit(
             unusable term, initial poses that do not match the windows, a fit that needs too much memory, or a cluster
             that ends.
     """
-    if config.learn_weights:
+    if config.learns_first:
         config = learn_weights(observations, bird, config, initial_poses, progress, source).config
     several = fit_runs(
         observations, bird, [config], initial_poses, progress, source, stored=stored, cluster=cluster, bodies=bodies
@@ -182,7 +182,7 @@ def fit_runs(
         InputError: as for `fit`.
         ValueError: the configs need different programs.
     """
-    if any(config.learn_weights for config in configs):
+    if any(config.learns_first for config in configs):
         raise InputError(
             "config", "`learn_weights` names terms, but several fits at once learn no weights", LEARN_REMEDY
         )

@@ -26,9 +26,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.linalg import null_space
 
 from jaxfit.config.yaml_file import rounded
-from jaxfit.fitting.solve import FitModel
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CropCamera, project
 from jaxfit.model.kinematics import Pose, Rig, move_keypoints, window_keypoints, window_transforms
@@ -57,27 +57,58 @@ class Offsets(NamedTuple):
         return dict(zip(bird.keypoint_names, rows, strict=True))
 
 
+def longest_distance(bird: Bird) -> float:
+    """Return the largest distance between keypoints at rest, model units."""
+    rest = np.asarray(bird.keypoints, np.float64)
+    return float(np.linalg.norm(rest[:, None] - rest, axis=-1).max())
+
+
 def first_offsets(bird: Bird, given: Mapping[str, Sequence[float]]) -> Offsets:
     """Return the offsets before learning: those of the config, else 0."""
-    rest = np.asarray(bird.keypoints, np.float64)
-    longest = np.linalg.norm(rest[:, None] - rest, axis=-1).max()
     offsets = np.array([given.get(name, (0.0, 0.0, 0.0)) for name in bird.keypoint_names], np.float64)
-    return Offsets(offsets, PRIOR_SHARE * float(longest))
+    return Offsets(offsets, PRIOR_SHARE * longest_distance(bird))
+
+
+def offset_directions(bird: Bird) -> Float[np.ndarray, "D K 3"]:
+    """Return the free directions of the offsets.
+
+    A keypoint and its mirror image have mirrored offsets. All keypoints together do not move, turn or grow, because the
+    place, the orientation and the size of a bird are free.
+    """
+    pairs, directions = [*bird.keypoint_pairs], []
+    paired = {k for pair in pairs for k in pair}
+    for k, other in [*pairs, *((k, k) for k in range(bird.num_keypoints) if k not in paired)]:
+        for axis in range(3) if other != k else (1, 2):
+            direction = np.zeros((bird.num_keypoints, 3))
+            direction[other, axis], direction[k, axis] = _MIRROR[axis], 1
+            directions.append(direction)
+    rest, free = np.asarray(bird.keypoints, np.float64), np.array(directions)
+    _, y, z = (rest - rest.mean(0)).T
+    zero, one = np.zeros_like(y), np.ones_like(y)
+    moves = (zero, one, zero), (zero, zero, one), (zero, -z, y), (rest - rest.mean(0)).T  # turn about the lateral axis
+    of_moves = [[(np.transpose(move) * direction).sum() for direction in free] for move in moves]
+    return np.tensordot(null_space(np.array(of_moves)).T, free, axes=1)
 
 
 def learn_offsets(
-    model: FitModel, before: Offsets, pose: Pose, targets: Targets, scale: Mapping[str, float]
+    bird: Bird,
+    rig: Rig,
+    camera: CropCamera,
+    before: Offsets,
+    pose: Pose,
+    targets: Targets,
+    scale: Mapping[str, float],
 ) -> Offsets:
     """Return the offsets of the keypoints for the poses of W windows.
 
     Args:
-        model: the bird, with the offsets `before`, and the camera.
+        bird, rig, camera: of the fit; the rig has the offsets `before`.
         before: the offsets with which the poses were fitted.
         pose: the poses.
         targets: the observations. Keypoints of confidence 0 do not count.
         scale: settings of `keypoint_likelihood`.
     """
-    keypoints_px, J = (np.asarray(each, np.float64) for each in _keypoints_and_slopes(model.rig, model.camera, pose))
+    keypoints_px, J = (np.asarray(each, np.float64) for each in _keypoints_and_slopes(rig, camera, pose))
     confidence = np.where(targets.present[..., None], targets.confidence, 0)
     seen = confidence > 0
     variance = keypoint_sd_px(confidence, scale["sd_sure_px"], scale["sd_unsure_px"]) ** 2
@@ -88,7 +119,7 @@ def learn_offsets(
     error = error + np.einsum("wtkac,kc->wtka", J, before.offsets)
     H = np.einsum("wtk,wtkab,wtkac->kbc", weight, J, J)
     slope = np.einsum("wtk,wtkac,wtka->kc", weight, J, error)
-    return _posterior(model.bird, H, slope, before.prior_sd)
+    return _posterior(bird, H, slope, before.prior_sd)
 
 
 def _posterior(bird: Bird, H: Float[np.ndarray, "K 3 3"], slope: Float[np.ndarray, "K 3"], prior_sd: float) -> Offsets:

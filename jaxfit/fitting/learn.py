@@ -213,7 +213,8 @@ def _learn_values(
         usable, old = fitted.failure == "", values
         if OFFSETS in names:
             seen = jax.tree.map(lambda x, rows=usable: np.asarray(x)[rows], (fitted.pose, batch.targets))
-            offsets = learn_offsets(model, offsets, *seen, config.stage_settings(stage)[KEYPOINTS])
+            known = model.bird, model.rig, model.camera
+            offsets = learn_offsets(*known, offsets, *seen, config.stage_settings(stage)[KEYPOINTS])
             config = replace(config, keypoint_offsets=offsets.by_name(model.bird))
             model = fit_model(model.bird, config)
         evidence = measure(model, config, stage, batch.targets, fitted.pose, usable, terms)

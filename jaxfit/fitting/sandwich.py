@@ -76,8 +76,9 @@ def constant_deviation(
     first: int,
     weight: float,
     present: Bool[np.ndarray, "T"],
-) -> Float[np.ndarray, "T P P"]:
-    """Return V·Vᵀ of each frame: the covariance that a deviation from the prior in the whole window adds.
+) -> tuple[Float[np.ndarray, "T L D"], Float[np.ndarray, "C D"]]:
+    """Return V, for the parameters of the frames and for the shared ones: a deviation from the prior in the whole
+    window adds V·Vᵀ to the covariance.
 
     Args:
         window: the posterior.
@@ -89,16 +90,14 @@ def constant_deviation(
     (T, _, C), at = window.precision.border.shape, window.columns.own
     inside = (at >= first) & (at < first + len(whitener))
     missing = 1 - 1 / max(int(present.sum()), 1)  # C = (1 − 1/n)·p⁻¹: a single frame misses nothing
-    if missing <= 0 or weight <= 0 or not inside.any():
-        return np.zeros((T, len(at) + C, len(at) + C))
     pull = np.zeros((T, len(at), len(whitener)))
+    if missing <= 0 or weight <= 0 or not inside.any():
+        return pull, np.zeros((C, len(whitener)))
     # p·C^½ in every frame: p = 2w·WᵀW has the square root √(2w)·Wᵀ, and C = missing·p⁻¹, so p·C^½ = √(2w·missing)·Wᵀ
     pull[:, inside] = np.sqrt(2 * weight * missing) * whitener.T[at[inside] - first]
     pull *= present[:, None, None]
     # V = H⁻¹(1 ⊗ p·C^½): one right-hand side for each parameter of the prior
-    own, shared = solve_blocks(window.factors, pull, np.zeros((C, len(whitener))))
-    V = np.concatenate([own, np.broadcast_to(shared, (T, *shared.shape))], axis=1)
-    return V @ V.swapaxes(1, 2)
+    return solve_blocks(window.factors, pull, np.zeros((C, len(whitener))))
 
 
 def lag_correlations(residuals: Float[np.ndarray, "T K 2"], counted: Bool[np.ndarray, "T K"]) -> np.ndarray:

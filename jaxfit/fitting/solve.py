@@ -17,12 +17,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfit.config.fit import FitConfig, InitialiseConfig, Parameter, StageConfig
 from jaxfit.fitting.initial_poses import InitialPoses
+from jaxfit.fitting.keypoint_offsets import PRIOR_SHARE, longest_distance, offset_directions
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program, Solver, problem_loss, problem_window
 from jaxfit.fitting.stored_programs import StoredProgram
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX, CropCamera
-from jaxfit.model.kinematics import Pose, Rig, fold_bird, move_keypoints
+from jaxfit.model.kinematics import Pose, Rig, fold_bird, move_keypoints, with_free_keypoints
 from jaxfit.objective.curvature import (
     SHARED_PARAMETERS,
 )
@@ -138,7 +139,7 @@ def advance(
 
 
 class Report(NamedTuple):
-    """The objective and the keypoints at a batch of poses."""
+    """The objective and the keypoints at a batch of poses; the keypoints are without offsets that were learnt."""
 
     loss: dict[str, Float[Array, "B"]]
     """Weighted value of each term in the objective."""
@@ -155,6 +156,8 @@ def report(program: Program, problems: Problem, pose: Pose) -> Report:
         window, settings = problem_window(program, problem, pose), problem.hyperparameters.settings
         values = evaluate_terms(window, program.terms, settings)
         weighted = {name: jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()}
+        if (shapes := program.rig.shape_basis.shape[0]) < len(pose.betas):
+            window = problem_window(program, problem, replace(pose, betas=jnp.asarray(pose.betas).at[shapes:].set(0)))
         return Report(weighted, window.keypoints_cam, window.keypoints_px)
 
     return jax.vmap(one)(problems, pose)
@@ -186,12 +189,33 @@ class FitModel(NamedTuple):
 
 
 def fit_model(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None = None) -> FitModel:
-    """Return the model of a fit: the bird, folded, with the keypoints of the config, and its crop camera."""
-    rig = fold_bird(bird)
+    """Return the model of a fit: the bird, folded, with the keypoints of the config, and its crop camera.
+
+    If the config learns `keypoint_offsets` with the bodies, the offsets are the last shape coefficients.
+    """
+    rig, priors = fold_bird(bird), priors_of(bird)
     if config.keypoint_offsets:
         offsets = [config.keypoint_offsets.get(name, (0.0, 0.0, 0.0)) for name in bird.keypoint_names]
         rig = move_keypoints(rig, np.array(offsets, np.float32))
-    return FitModel(bird, rig, priors_of(bird), crop_camera(config), initial_poses)
+    if learns_offsets(config):
+        directions = offset_directions(bird)
+        rig = with_free_keypoints(rig, directions)
+        offset_sd = np.full(len(directions), PRIOR_SHARE * longest_distance(bird), np.float32)
+        priors = priors._replace(shape_sd=jnp.concatenate([priors.shape_sd, offset_sd]))
+    return FitModel(bird, rig, priors, crop_camera(config), initial_poses)
+
+
+def with_offsets(model: FitModel, pose: Pose) -> Pose:
+    """Return a pose with all shape coefficients of the model; offsets of keypoints that it lacks are 0."""
+    free = len(model.rig.keypoint_shape_map) - np.shape(pose.betas)[-1]
+    return replace(pose, betas=np.pad(pose.betas, [(0, 0)] * (np.ndim(pose.betas) - 1) + [(0, free)]))
+
+
+def learns_offsets(config: FitConfig) -> bool:
+    """Return whether the offsets of the keypoints are learnt with the bodies, as shape coefficients."""
+    if config.body_stage is None or config.learns_first or "keypoint_offsets" not in config.learn_weights:
+        return False
+    return "betas" in config.stages[config.body_stage].optimised
 
 
 def crop_camera(config: FitConfig) -> CropCamera:
@@ -312,7 +336,8 @@ def compiled_part(config: FitConfig) -> FitConfig:
         overlap=0,
         filter_window=1,
         min_keypoints=1,
-        learn_weights=(),
+        # learnt offsets are further shape coefficients
+        learn_weights=("keypoint_offsets",) if learns_offsets(config) else (),
         crop=replace(config.crop, padding=0.0),
         initialise=InitialiseConfig(hypotheses=config.initialise.hypotheses),
     )

@@ -127,15 +127,16 @@ def _error_bars(arrays: Mapping[str, np.ndarray], i: int) -> ErrorBars | None:
 
 
 def _packed_evidence(result: FittedWindow) -> np.ndarray:
-    return np.zeros(0) if result.body is None else np.concatenate([each.ravel() for each in result.body])
+    return np.zeros(0) if result.body is None else np.concatenate([np.ravel(each) for each in result.body])
 
 
 def _evidence(arrays: Mapping[str, np.ndarray], i: int) -> BodyEvidence | None:
-    packed, K = arrays["body"][i], arrays["keypoints_cam"].shape[2]
+    packed, K, D = arrays["body"][i], arrays["keypoints_cam"].shape[2], 3 * arrays["body_pose"].shape[2]
     if not len(packed):
         return None
-    P = math.isqrt((len(packed) - 4 * K) // 2)  # P + 2P² + 4K numbers, and 2P² ≤ P + 2P² < 2(P + 1)²
-    shapes = (P,), (P, P), (P, P), (K, 2), (K,), (K,)
+    # P + P² + P·D + 4K + 1 numbers
+    P = round((math.sqrt((1 + D) ** 2 + 4 * (len(packed) - 4 * K - 1)) - 1 - D) / 2)
+    shapes = (P,), (P, P), (P, D), (K, 2), (K,), (K,), ()
     ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
     parts = np.split(packed, ends)
     return BodyEvidence(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))

@@ -36,11 +36,12 @@ class Start(NamedTuple):
     """The optimum of the stages before, with the bone lengths and the shape of the body."""
     ambiguity_deg: Float[np.ndarray, "T"]
     body_covariance: Float[np.ndarray, "P P"]
+    keypoint_scale: Float[np.ndarray, ""]
 
     @property
     def content(self) -> bytes:
         """The content that determines the result, beside the window and the config."""
-        return b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves((self.pose, self.body_covariance)))
+        return b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves((self.pose, *self[2:])))
 
 
 class FitTask(NamedTuple):
@@ -141,9 +142,9 @@ def gather_batch(model: FitModel, task: FitTask) -> Batch:
     runs = np.array([r for r, _ in task.problems])
     if task.starts is not None:
         starts = [task.starts[problem] for problem in task.problems]
-        pose, ambiguity_deg, covariance = jax.tree.map(lambda *x: np.stack(x), *starts)
+        pose, ambiguity_deg, *of_bodies = jax.tree.map(lambda *x: np.stack(x), *starts)
         pose = jax.tree.map(lambda x: x[:, None], pose)  # one hypothesis
-        return Batch(targets, pose, runs, targets_row, np.arange(len(starts)), ambiguity_deg, covariance)
+        return Batch(targets, pose, runs, targets_row, np.arange(len(starts)), ambiguity_deg, *of_bodies)
     poses, pose_row = _prepare_rows(task, pose_key, lambda windows, config: initial_poses_of(windows, config, model))
     return Batch(targets, poses, runs, targets_row, pose_row)
 
@@ -243,7 +244,7 @@ def fit_windows(
     for r, (config, of_run) in enumerate(zip(task.configs, task.windows, strict=True)):
         rows = [w for run, w in task.problems if run == r]
         evidence = [None if windows[r, w].failure else windows[r, w].body for w in rows]
-        bodies.append(estimate_bodies(of_run.track[rows], evidence, model.bird, config, species) | dict(known or {}))
+        bodies.append(estimate_bodies(of_run.track[rows], evidence, model, config, species) | dict(known or {}))
         for w in rows:
             fitted, body = windows.pop((r, w)), bodies[r][int(of_run.track[w])]
             if fitted.failure:  # no later stage: the loss has the terms of the last stage
@@ -251,8 +252,8 @@ def fit_windows(
                 windows[r, w] = fitted._replace(loss=loss, body=None)
                 continue
             betas = body.betas[: len(fitted.pose.betas)]  # none for a fit without shape coefficients
-            pose = replace(fitted.pose, bone_length=body.bone_length, betas=betas)
-            starts[r, w] = Start(pose, fitted.ambiguity_deg, body.covariance)
+            pose = replace(fitted.pose, bone_length=body.bone_length, betas=np.concatenate([betas, body.offsets]))
+            starts[r, w] = Start(pose, fitted.ambiguity_deg, body.covariance, np.array(body.keypoint_scale, np.float32))
     if starts:
         second = task._replace(problems=[problem for problem in task.problems if problem in starts], starts=starts)
         windows |= run(second, f"{subject} with their bodies")

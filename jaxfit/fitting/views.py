@@ -76,8 +76,8 @@ _logger = logging.getLogger(__name__)
 def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
     """Return a config for several views: depth and size are optimised, with the prior of the size.
 
-    The silhouettes have an unbiased edge, and pixels that other birds may cover do not count. Learnt weights are
-    those of one view, and are switched off.
+    The silhouettes have an unbiased edge, and pixels that other birds may cover do not count. Nothing is learnt before
+    the fit, because that is for one view.
     """
     used = config if has_masks else without_mask_stages(config)
     # a silhouette that is larger than its mesh, or a mask that another bird cuts, would bias the size
@@ -92,7 +92,7 @@ def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
     return replace(
         used,
         stages=tuple(free(stage) for stage in used.stages),
-        learn_weights=(),
+        learn_weights=() if used.learns_first else used.learn_weights,
         initialise=replace(used.initialise, hypotheses=1),
     )
 

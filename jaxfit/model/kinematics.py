@@ -71,7 +71,7 @@ class Rig(eqx.Module):
     keypoint_map: Float[Array, "K J 4"]
     """Σ_v keypoint_weights · skin_weights · (v, 1): keypoints as a linear map of the joint transforms."""
     keypoint_shape_map: Float[Array, "S K J 3"]
-    """The same map for each shape direction."""
+    """The same map for each shape direction, and for directions that move keypoints only (`with_free_keypoints`)."""
     vertices: Float[Array, "3 V"]
     """Rest vertices. V is the last axis here and below, so that products run along contiguous memory."""
     skin_weights: Float[Array, "J V"]
@@ -80,6 +80,7 @@ class Rig(eqx.Module):
     vertex_weights: Float[Array, "V M"]
     """Skinning weights of these joints; 0 for entries that are not used."""
     shape_basis: Float[Array, "S 3 V"]
+    """Coefficients after the first S move keypoints only."""
     faces: Int[Array, "F 3"]
     parents: tuple[int, ...] = eqx.field(static=True)
     joint_names: tuple[str, ...] = eqx.field(static=True)
@@ -130,6 +131,18 @@ def move_keypoints(rig: Rig, offsets: Float[Array | np.ndarray, "K 3"]) -> Rig:
     return replace(rig, keypoint_map=jnp.concatenate([linear + offsets[:, None] * constant, constant], axis=-1))
 
 
+def with_free_keypoints(rig: Rig, directions: Float[np.ndarray, "D K 3"]) -> Rig:
+    """Return the rig with D further shape coefficients, which move keypoints and not the mesh.
+
+    Args:
+        rig: the folded bird.
+        directions: movement of the rest positions of the keypoints for a coefficient of 1, model units.
+    """
+    constant = rig.keypoint_map[..., 3:]  # as for `move_keypoints`
+    moved = jnp.asarray(directions, jnp.float32)[:, :, None] * constant
+    return replace(rig, keypoint_shape_map=jnp.concatenate([rig.keypoint_shape_map, moved]))
+
+
 def joint_transforms(rig: Rig, pose: Pose) -> Float[Array, "J 3 4"]:
     """Return the unit-scale joint transforms A_j: a rest point v that moves only with joint j is posed at A_j·(v, 1).
 
@@ -165,10 +178,14 @@ def joint_transforms(rig: Rig, pose: Pose) -> Float[Array, "J 3 4"]:
 def posed_keypoints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "K 3"]:
     """Return the posed keypoints of one frame from its joint transforms, camera frame, model units."""
     unit = jnp.einsum("kjc,jdc->kd", rig.keypoint_map, A)
-    if rig.shape_basis.shape[0]:
-        shaped = jnp.tensordot(pose.betas, rig.keypoint_shape_map, axes=1)  # (K, J, 3)
-        unit = unit + jnp.einsum("kjc,jdc->kd", shaped, A[..., :3])
+    if len(pose.betas):
+        unit = unit + jnp.einsum("kjc,jdc->kd", _keypoint_shape(rig, pose), A[..., :3])
     return unit * pose.scale + pose.transl
+
+
+def _keypoint_shape(rig: Rig, pose: Pose) -> Float[Array, "K J 3"]:
+    """Return the change of the keypoint map by the coefficients of a pose; those that the pose lacks are 0."""
+    return jnp.tensordot(pose.betas, rig.keypoint_shape_map[: len(pose.betas)], axes=1)
 
 
 def posed_vertices(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "V 3"]:
@@ -182,7 +199,7 @@ def posed_vertices(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Arra
 
 def shaped_vertices(rig: Rig, pose: Pose) -> Float[Array, "3 V"]:
     """Return the rest vertices of the shape of a pose, model units."""
-    return rig.vertices + jnp.tensordot(pose.betas, rig.shape_basis, axes=1)
+    return rig.vertices + jnp.tensordot(pose.betas[: rig.shape_basis.shape[0]], rig.shape_basis, axes=1)
 
 
 def posed_joints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "J 3"]:
@@ -262,8 +279,8 @@ def keypoint_rotation_rows(
     """
     descendants = jnp.asarray(_descendants(rig.parents), jnp.float32)
     keypoint_map = rig.keypoint_map
-    if rig.shape_basis.shape[0]:
-        keypoint_map = keypoint_map.at[..., :3].add(jnp.tensordot(pose.betas, rig.keypoint_shape_map, axes=1))
+    if len(pose.betas):
+        keypoint_map = keypoint_map.at[..., :3].add(_keypoint_shape(rig, pose))
     moved = jnp.einsum("kdc,dxc->kxd", keypoint_map, A) @ descendants
     weight = keypoint_map[..., 3] @ descendants
     lever = pose.scale * (moved - weight[:, None] * unit_joints(rig, A).T)  # (K, 3, J)
@@ -286,7 +303,7 @@ def window_keypoint_rows(
 
 
 def keypoint_derivatives(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose, name: str) -> Float[Array, "K 3 n"]:
-    """Return the derivatives of the keypoints with respect to `bone_length` (n = J−1) or `betas` (n = S).
+    """Return the derivatives of the keypoints with respect to `bone_length` (n = J−1) or `betas`.
 
     Args:
         rig: the folded bird.
@@ -353,8 +370,8 @@ def window_transform_derivatives(
 
 
 def shape_derivatives(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "V 3 S"]:
-    """Return the derivatives of the posed vertices of one frame with respect to the shape coefficients, camera frame,
-    model units."""
+    """Return the derivatives of the posed vertices of one frame with respect to the S coefficients that move the mesh,
+    camera frame, model units."""
     turn = (A[..., :3].reshape(-1, 9).T @ rig.skin_weights).reshape(3, 3, -1)
     return jnp.asarray(pose.scale) * jnp.einsum("dcv,scv->vds", turn, rig.shape_basis)
 

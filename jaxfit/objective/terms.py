@@ -52,6 +52,9 @@ def _mask_and_blocks(window: PosedWindow, kind: Kind) -> tuple[Scalar, FrameBloc
     values, blocks = jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window), *skin)
     if window.targets.views is not None:
         blocks = blocks.reshape(len(window.present), -1, *blocks.shape[1:]).sum(axis=1)
+    if "betas" in window.shared:  # the last columns, of coefficients that move keypoints only
+        free = len(window.pose.betas) - window.skin.shape_slope.shape[-1]
+        blocks = jnp.pad(blocks, ((0, 0), (0, free), (0, free)))
     return jnp.sum(values), blocks
 
 

@@ -80,7 +80,7 @@ def refit(
     old, new = windows_of(before, config, source), windows_of(after, config, source)
     rows = {window_hash(old, w): w for w in range(len(old))}
     source_row = np.array([rows.get(window_hash(new, w), -1) for w in range(len(new))])
-    earlier, bodies, kept = bodies_of(solution, config), {}, {}
+    earlier, bodies, kept = bodies_of(solution, bird, config), {}, {}
     if earlier:
         kept = _origins(source_row, old, new)
         bodies = {track: earlier[origin] for track, origin in kept.items() if origin in earlier}

@@ -16,6 +16,7 @@ from jaxfit.cli.fitting import _known_bodies
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import StageConfig, load_config
 from jaxfit.data.solution import load_solution, save_solution
+from jaxfit.fitting import bodies
 from jaxfit.fitting.bodies import (
     ASYMMETRY_SD,
     SHARES,
@@ -27,10 +28,15 @@ from jaxfit.fitting.bodies import (
 )
 from jaxfit.fitting.error_bars import _with_body
 from jaxfit.fitting.fit import fit, fit_runs, learn_weights, model_of_fit
+from jaxfit.fitting.keypoint_offsets import offset_directions
 from jaxfit.fitting.posterior import BodySensitivity
+from jaxfit.fitting.solve import fit_model
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.unfinished import Parts
+from jaxfit.model.camera import project
+from jaxfit.model.kinematics import fold_bird, move_keypoints, window_keypoints, window_transforms
+from jaxfit.objective.posed_window import priors_of
 from jaxfit.review.correct import refit
 from jaxfit.review.edits import Edit, apply_edits
 from jaxfit.simulation.flock import smooth_motion
@@ -59,7 +65,20 @@ TERM_SETTINGS = {
     "place_likelihood": {"sd_px_s2": 3000.0},
 }
 CONFIG = dataclasses.replace(config(memory_gb=1.0), terms=TERM_SETTINGS, stages=stages())
+SHAPED = tiny_bird(shapes=2)
+OFFSETS = dataclasses.replace(
+    CONFIG,
+    terms=TERM_SETTINGS | {"shape_prior": 0.5},
+    stages=tuple(
+        dataclasses.replace(stage, terms=(*stage.terms, "shape_prior"), optimised=(*stage.optimised, "betas"))
+        if stage.share_body
+        else stage
+        for stage in stages()
+    ),
+)
 
+
+MODEL = fit_model(BIRD, CONFIG)
 
 LENGTHS = np.float32([[1.25, 0.85, 0.85], [0.8, 1.2, 1.2]])
 """Bone lengths of two birds: head, left wing, right wing."""
@@ -93,8 +112,9 @@ def with_species(body, terms):
 def evidence(window_means, precision, errors):
     """Return the evidence of a window: errors (T, K, 2) of keypoints."""
     sums, squares = errors.sum(0), (errors**2).sum((0, 2))
-    nothing = np.zeros_like(precision)
-    return BodyEvidence(window_means, precision, nothing, sums, squares, np.full(errors.shape[1], float(len(errors))))
+    nothing = np.zeros((len(precision), 3 * BONES))
+    counts = np.full(errors.shape[1], float(len(errors)))
+    return BodyEvidence(window_means, precision, nothing, sums, squares, counts, np.ones(()))
 
 
 def prior_precision():
@@ -120,7 +140,7 @@ def test_body_is_the_posterior_of_all_windows():
         rows.append(J)
         right.append(y)
     expected = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
-    (body,) = estimate_bodies(np.zeros(3, int), windows, BIRD, CONFIG).values()
+    (body,) = estimate_bodies(np.zeros(3, int), windows, MODEL, CONFIG).values()
     np.testing.assert_allclose(body.bone_length, expected, rtol=1e-5)
     stacked = np.concatenate(rows)
     np.testing.assert_allclose(
@@ -134,11 +154,11 @@ def test_a_posture_that_lasts_is_noise_of_the_score():
     rng, mean = np.random.default_rng(5), np.asarray(BIRD.bone_mean, np.float64)
     prior, symmetric = prior_precision()
     errors = rng.standard_normal((50, 8, 2)) + 1  # a part of the errors is common
-    J, y, M = rng.standard_normal((20, BONES)), rng.standard_normal(BONES), rng.standard_normal((BONES, BONES))
-    of_data, M = J.T @ J, M @ M.T
+    J, y, M = rng.standard_normal((20, BONES)), rng.standard_normal(BONES), rng.standard_normal((BONES, 3 * BONES))
+    of_data = J.T @ J
     window = evidence(np.linalg.solve(of_data + prior, y + prior @ mean), of_data + prior, errors)
-    (body,) = estimate_bodies(np.zeros(1, int), [window._replace(posture=M)], BIRD, CONFIG).values()
-    noise = of_data * 50 / body.frames + M
+    (body,) = estimate_bodies(np.zeros(1, int), [window._replace(posture=M)], MODEL, CONFIG).values()
+    noise = of_data * 50 / body.frames + M @ M.T
     weighted = of_data @ np.linalg.inv(noise)
     # the posterior of a window contains the broad prior of precision 1, and its optimum does not
     broad = weighted @ (np.linalg.solve(of_data + prior, y + prior @ mean) - mean)
@@ -158,7 +178,7 @@ def test_errors_that_all_frames_share_count_once():
         "half": errors + np.random.default_rng(2).standard_normal((1, 40, 2)),
         "constant": np.ones((400, 40, 2)),
     }.items():
-        (body,) = estimate_bodies(np.zeros(1, int), [evidence(mean + 0.1, A, values)], BIRD, CONFIG).values()
+        (body,) = estimate_bodies(np.zeros(1, int), [evidence(mean + 0.1, A, values)], MODEL, CONFIG).values()
         frames[name] = body.frames
         assert (np.abs(body.bone_length - mean) <= 0.1 + 1e-6).all()
     assert frames["independent"] > 300
@@ -182,7 +202,7 @@ def test_two_birds_under_one_track(difference, agree):
                 errors = rng.standard_normal((50, 40, 2))
                 errors -= errors.mean(0)  # all frames count
                 windows.append(evidence(np.linalg.solve(A, precise @ seen + prior @ mean), A, errors))
-        (body,) = estimate_bodies(np.zeros(4, int), windows, BIRD, CONFIG).values()
+        (body,) = estimate_bodies(np.zeros(4, int), windows, MODEL, CONFIG).values()
         wrong += body.agree != agree
     assert wrong == 0
 
@@ -192,7 +212,7 @@ def test_bodies_of_species_are_the_joint_posterior(true_share):
     """The oracle: all bodies and all data as one Gaussian, for every pair of shares on the grid."""
     rng, bird = np.random.default_rng(6), tiny_bird(shapes=2)
     settings = with_species(("bone_length", "betas"), {**TERM_SETTINGS, "shape_prior": 0.5})
-    mean, precision, broad = _prior(bird, settings)
+    mean, precision, broad = _prior(priors_of(bird), settings)
     C, species = np.linalg.inv(_symmetric(precision, bird)), np.array([7, 3, 7, 5, 7, 3, 3, 7])
     (P, N), same = (len(mean), len(species)), species[:, None] == species
 
@@ -221,9 +241,9 @@ def test_bodies_of_species_are_the_joint_posterior(true_share):
     for n in range(N):
         A = J[n].T @ J[n] + precision
         windows.append(evidence(mean + np.linalg.solve(A - broad, J[n].T @ y[n]), A, white))
-    bodies = estimate_bodies(np.arange(N), windows, bird, settings, species)
+    found_bodies = estimate_bodies(np.arange(N), windows, fit_model(bird, settings), settings, species)
     expected, spread = best[shares]
-    for n, body in bodies.items():
+    for n, body in found_bodies.items():
         own = slice(n * P, (n + 1) * P)
         found = np.concatenate([body.bone_length, body.betas])
         np.testing.assert_allclose(found, mean + expected[own], rtol=1e-4, atol=1e-4)
@@ -246,11 +266,90 @@ def test_a_bird_alone_in_its_species_has_its_own_body(fitted):
     assert (together.bone_length_sd < apart.bone_length_sd).all()
 
 
+def test_offsets_are_those_of_all_birds(monkeypatch):
+    """The oracle stacks the data of two birds and all priors in one least-squares problem with common columns."""
+    monkeypatch.setattr(bodies, "WIDTHS", (1.0,))
+    config = dataclasses.replace(OFFSETS, learn_weights=("keypoint_offsets",))
+    rng, model = np.random.default_rng(8), fit_model(SHAPED, config)
+    D, shapes = len(offset_directions(SHAPED)), SHAPED.num_shapes
+    own, P = BONES + shapes, BONES + shapes + D
+    prior, symmetric = np.eye(P), np.zeros((P, P))
+    prior[:BONES, :BONES], symmetric[:BONES, :BONES] = prior_precision()
+    sds = np.asarray(model.priors.shape_sd, np.float64)
+    prior[range(BONES, P), range(BONES, P)] = sds**-2 + 0.01
+    symmetric[BONES:, BONES:] = prior[BONES:, BONES:]
+    broad = np.diag([1.0] * BONES + [0.01] * (P - BONES))
+    mean = np.concatenate([np.asarray(SHAPED.bone_mean, np.float64), np.zeros(P - BONES)])
+    white = rng.standard_normal((50, 8, 2))
+    white -= white.mean(0)
+    rows, right, windows = [], [], []
+    root = np.linalg.cholesky(symmetric).T
+    for n in range(2):
+        place = np.zeros((P, 2 * own + D))
+        place[:own, n * own : (n + 1) * own], place[own:, 2 * own :] = np.eye(own), np.eye(D)
+        J, y = 20 * rng.standard_normal((40, P)), 5 * rng.standard_normal(40)
+        A = J.T @ J + prior
+        windows.append(evidence(np.linalg.solve(A - broad, J.T @ y + (prior - broad) @ mean), A, white))
+        # the prior of the offsets counts once
+        rows += [J @ place, root[:own] @ place, *([root[own:] @ place] if n == 0 else [])]
+        right += [y, root[:own] @ mean, *([np.zeros(D)] if n == 0 else [])]
+    stacked = np.concatenate(rows)
+    expected = np.linalg.lstsq(stacked, np.concatenate(right), rcond=None)[0]
+    covariance = np.linalg.inv(stacked.T @ stacked)
+    for n, body in estimate_bodies(np.arange(2), windows, model, config).items():
+        columns = np.r_[n * own : (n + 1) * own, 2 * own : 2 * own + D]
+        found = np.concatenate([body.bone_length, body.betas, body.offsets])
+        np.testing.assert_allclose(found, expected[columns], rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(body.covariance, covariance[np.ix_(columns, columns)], rtol=1e-4, atol=1e-7)
+    # a posture that all birds have in common can explain the same score: the data say less about the offsets
+    U = 10 * rng.standard_normal((P, 3 * BONES))
+    postured = [window._replace(posture=window.precision @ U) for window in windows]
+    unsure = estimate_bodies(np.arange(2), postured, model, config)[0]
+    assert (np.diagonal(unsure.covariance)[own:] > 2 * np.diagonal(body.covariance)[own:]).all()
+
+
+def test_fit_finds_the_offsets_of_the_detector(tmp_path):
+    """The keypoints of the result are those of the model, without the offsets; a later fit can keep the offsets."""
+    directions = offset_directions(SHAPED)
+    offsets = np.tensordot(np.random.default_rng(3).choice([-0.1, 0.1], len(directions)), directions, axes=1)
+    mean_pose = np.broadcast_to(np.asarray(SHAPED.pose_mean).reshape(BONES, 3), (T, BONES, 3))
+    motions = [jax.tree.map(np.asarray, smooth_motion(SHAPED, T, n)) for n in range(8)]
+    poses = [dataclasses.replace(motion, body_pose=mean_pose) for motion in motions]
+    known_posture = dataclasses.replace(OFFSETS, terms=dict(OFFSETS.terms) | {"pose_prior": 500.0})
+    exact = detect(SHAPED, poses, 0.0, 0.0, 0, camera=CAMERA)
+    rig = fold_bird(SHAPED)
+    moved_px = [
+        np.asarray(project(window_keypoints(move_keypoints(rig, offsets), window_transforms(rig, pose), pose), CAMERA))
+        for pose in poses
+    ]
+    observed = exact.with_keypoints(np.stack(moved_px), exact.confidence)
+    fixed, learnt = (
+        fit(observed, SHAPED, dataclasses.replace(known_posture, learn_weights=names))
+        for names in ((), ("keypoint_offsets",))
+    )
+    np.testing.assert_array_equal(fixed.bodies.keypoint_offsets, 0)
+    found = learnt.bodies.keypoint_offsets
+    np.testing.assert_array_equal(found[0], found[1])
+    assert np.linalg.norm(found[0] - offsets) < 0.7 * np.linalg.norm(offsets)
+
+    def error_px(solution):
+        return np.linalg.norm(solution.keypoints.px - exact.keypoints_px, axis=-1).mean()
+
+    assert error_px(learnt) < 0.85 * error_px(fixed)
+    save_solution(learnt, SHAPED, "", {}, tmp_path / "result")
+    config = dataclasses.replace(known_posture, learn_weights=("keypoint_offsets",))
+    known = bodies_of(load_solution(tmp_path / "result")[0], SHAPED, config)
+    again = fit(observed, SHAPED, config, bodies=known)
+    np.testing.assert_allclose(again.keypoints.px, learnt.keypoints.px, atol=1e-3)
+
+
 def test_without_a_usable_window_the_body_is_that_of_the_model():
     unknown = np.full((BONES, BONES), np.nan)
-    nothing = BodyEvidence(np.ones(BONES), unknown, unknown, np.zeros((8, 2)), np.zeros(8), np.zeros(8))
-    bodies = estimate_bodies(np.array([0, 1]), [nothing, None], BIRD, CONFIG)
-    for body in bodies.values():
+    nothing = BodyEvidence(
+        np.ones(BONES), unknown, np.zeros((BONES, 3 * BONES)), np.zeros((8, 2)), np.zeros(8), np.zeros(8), np.ones(())
+    )
+    of_model = estimate_bodies(np.array([0, 1]), [nothing, None], MODEL, CONFIG)
+    for body in of_model.values():
         np.testing.assert_array_equal(body.bone_length, np.asarray(BIRD.bone_mean))
         assert body.frames == 0
         assert body.determined == pytest.approx(0, abs=1e-9)
@@ -324,7 +423,7 @@ def test_known_body_is_kept(fitted, tmp_path):
     observed, solution = fitted
     save_solution(solution, BIRD, "", {}, tmp_path / "result")
     loaded, _ = load_solution(tmp_path / "result")
-    known = bodies_of(loaded, CONFIG)
+    known = bodies_of(loaded, BIRD, CONFIG)
     assert list(known) == observed.track_id.tolist()
     changed = {1: known[1]._replace(bone_length=np.full(BONES, 1.25, np.float32))}
     again = fit(observed, BIRD, dataclasses.replace(CONFIG, error_bars=True), bodies=changed)
@@ -355,7 +454,35 @@ def test_a_shape_that_the_config_fixes_is_refused(fitted, tmp_path):
     options = argparse.Namespace(body=tmp_path / "result", config="own")
     with pytest.raises(InputError, match="bodies with a shape"):
         _known_bodies(options, CONFIG, bird, [1])
-    assert bodies_of(solution, with_values(load_config("map"), {}))[1].betas.tolist() == [1, 1]
+    assert bodies_of(solution, bird, with_values(load_config("map"), {}))[1].betas.tolist() == [1, 1]
+
+
+LEARNING = dataclasses.replace(CONFIG, learn_weights=("keypoint_likelihood",))
+
+
+def test_scale_of_keypoint_errors_is_learnt_for_each_track():
+    """The errors of the first bird are eight times as large as the config says, those of the second are smaller."""
+    exact = detect(BIRD, individuals(2 * T), 0.0, 0.0, 0, camera=CAMERA)
+    noise_px = np.random.default_rng(0).standard_normal(exact.keypoints_px.shape) * np.reshape([4.0, 0.1], (2, 1, 1, 1))
+    observed = exact.with_keypoints(exact.keypoints_px + noise_px, exact.confidence)
+    fixed, learnt = (fit(observed, BIRD, each) for each in (CONFIG, LEARNING))
+    np.testing.assert_array_equal(fixed.bodies.keypoint_scale, 1)
+    assert 4 < learnt.bodies.keypoint_scale[0] < 16
+    # errors that agree between frames look small: the scale of the config is the least
+    assert learnt.bodies.keypoint_scale[1] == 1
+
+    def error_px(solution):
+        return np.linalg.norm(solution.keypoints.px[0] - exact.keypoints_px[0], axis=-1).mean()
+
+    assert error_px(learnt) < 0.9 * error_px(fixed)
+    # one config for each run, and each bird keeps what was learnt about it
+    runs = fit_runs(observed, BIRD, [CONFIG, LEARNING])
+    for run, alone in zip(runs, (fixed, learnt), strict=True):
+        np.testing.assert_array_equal(run.bodies.keypoint_scale, alone.bodies.keypoint_scale)
+        np.testing.assert_allclose(run.poses.body_pose, alone.poses.body_pose, atol=1e-4)
+    known = bodies_of(learnt, BIRD, LEARNING)
+    again = fit(observed, BIRD, LEARNING, bodies=known)
+    np.testing.assert_array_equal(again.poses.body_pose, learnt.poses.body_pose)
 
 
 def test_several_configs_keep_their_settings(fitted):

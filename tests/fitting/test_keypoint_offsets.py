@@ -75,9 +75,18 @@ def one_window(pose):
     return jax.device_put(jax.tree.map(lambda values: np.asarray(values)[None], pose))
 
 
+def used(config):
+    return BIRD, fit_model(BIRD, config).rig, CAMERA
+
+
 def learnt(points_px, confidence=1.0):
-    model = fit_model(BIRD, PLAIN)._replace(camera=CAMERA)
-    return learn_offsets(model, first_offsets(BIRD, {}), one_window(POSE), targets(points_px, confidence), SCALE)
+    return learn_offsets(
+        *used(PLAIN),
+        first_offsets(BIRD, {}),
+        one_window(POSE),
+        targets(points_px, confidence),
+        SCALE,
+    )
 
 
 def test_a_moved_keypoint_moves_like_a_vertex_beside_the_old_one():
@@ -120,7 +129,7 @@ def test_offsets_are_0_without_data_and_smaller_with_little_data():
     longest = max(np.linalg.norm(a - b) for a in rest for b in rest)
     assert nothing.prior_sd == pytest.approx(PRIOR_SHARE * longest, rel=1e-5)
     unsure = learn_offsets(
-        fit_model(BIRD, PLAIN)._replace(camera=CAMERA),
+        *used(PLAIN),
         first_offsets(BIRD, {}),
         one_window(POSE),
         targets(exact),
@@ -188,7 +197,7 @@ def test_learnt_offsets_do_not_change_once_they_are_found():
     first = learnt(exact)
     given = dataclasses.replace(PLAIN, keypoint_offsets=first.by_name(BIRD))
     again = learn_offsets(
-        fit_model(BIRD, given)._replace(camera=CAMERA),
+        *used(given),
         first_offsets(BIRD, given.keypoint_offsets),
         one_window(POSE),
         targets(exact),

@@ -81,7 +81,8 @@ def test_error_bars_of_a_constant_pose_are_those_of_many_fits():
     measured = line.errors(poses, noise).var(axis=0)
     plain = line.window.covariance.of_frames()
     present = np.ones(line.frames, bool)
-    wide = plain + constant_deviation(line.window, line.whitener, 0, line.weight, present)
+    V, _ = constant_deviation(line.window, line.whitener, 0, line.weight, present)
+    wide = plain + V @ V.swapaxes(1, 2)
     middle = slice(5, -5)
     sd, plain_sd, true_sd = (
         np.sqrt(np.mean(each[middle, 1])) for each in (*(np.einsum("tii->ti", c) for c in (wide, plain)), measured)
@@ -94,11 +95,11 @@ def test_a_single_frame_keeps_its_posterior():
     line = Line()
     one = posterior_of(blocks(line.H[:2, :2], 1, 2), Columns(np.arange(2), np.zeros(0, int)), np.full((1, 2), 1e-9))
     assert not isinstance(one, str)
-    assert not constant_deviation(one, line.whitener, 0, line.weight, np.ones(1, bool)).any()
+    assert not constant_deviation(one, line.whitener, 0, line.weight, np.ones(1, bool))[0].any()
     assert time_factor(lag_correlations(np.ones((1, 9, 2)), np.ones((1, 9), bool)), 1.0) == 1
     # so does a window with one frame with the bird
     only = np.arange(line.frames) == 3
-    assert not constant_deviation(line.window, line.whitener, 0, line.weight, only).any()
+    assert not constant_deviation(line.window, line.whitener, 0, line.weight, only)[0].any()
 
 
 def test_noise_that_agrees_between_frames():

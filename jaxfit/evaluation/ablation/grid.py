@@ -135,14 +135,14 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
     """Return a run for each point; runs with equal configs are merged.
 
     Args:
-        base: the config that every run starts from. Its `learn_weights` does not count, because runs vary weights.
+        base: the config that every run starts from. Weights are not learnt before a fit, because runs vary weights.
         points: for each run, path of a config key → value that replaces the value of the base.
         source: the grid file, for error messages.
 
     Raises:
         InputError: a key is unknown, or a value is invalid.
     """
-    if base.learn_weights:
+    if base.learns_first:
         _logger.warning("%s: the runs learn no weights, because an ablation sets the weights itself", source)
         base = replace(base, learn_weights=())
     kept: dict[Any, tuple[FitConfig, Mapping[str, Any]]] = {}

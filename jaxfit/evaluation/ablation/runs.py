@@ -64,7 +64,7 @@ def fit_batches(
     Raises:
         InputError: as `fit_runs`; a config learns its weights.
     """
-    if any(run.config.learn_weights for run in runs):
+    if any(run.config.learns_first for run in runs):
         raise InputError("config", "`learn_weights` would change the weights that an ablation sets", LEARN_REMEDY)
     groups: dict[Any, list[int]] = {}
     for r, run in enumerate(runs):

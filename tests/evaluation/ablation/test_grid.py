@@ -70,12 +70,15 @@ def test_equal_runs_are_one(tmp_path, caplog):
 
 
 def test_the_runs_of_a_config_that_learns_weights_learn_none(tmp_path, caplog):
-    (tmp_path / "fit.yaml").write_text("base: map\nlearn_weights: [mask_smooth_l1]")
+    (tmp_path / "fit.yaml").write_text("base: photo")
     (tmp_path / "grid.yaml").write_text(
         f"config: {tmp_path / 'fit.yaml'}\ncrosses: [{{cross: {{terms.pose_prior: [1, 2]}}}}]"
     )
     assert not any(run.config.learn_weights for run in load_grid(tmp_path / "grid.yaml")[0])
     assert "learn no weights" in caplog.text
+    # what is learnt with the bodies belongs to every run
+    (tmp_path / "fit.yaml").write_text("base: map")
+    assert all(run.config.learn_weights for run in load_grid(tmp_path / "grid.yaml")[0])
 
 
 def test_the_number_of_runs_is_checked_before_the_runs_are_made(tmp_path):
