@@ -260,8 +260,9 @@ def reconstruct(
                 _draw(solution, bird, video, part / OVERLAY, tracking.observations, config.overlay, progress)
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
             if carried is not None:
-                facts = {"file": str(labels), "used": carried.used, "problems": carried.problems}
-                summary["labels"] = facts | {"frames": origin_counts(tracking.observations)}
+                summary["labels"] = {"file": str(labels), "used": carried.used, "problems": carried.problems}
+            if config.track.keypoints.file == NONE:
+                summary["pose_sources"] = origin_counts(tracking.observations)
             settings = config_to_yaml(config)
             write_coco(tracking.observations, part / OBSERVATIONS, tracking.info())
             write_solution(solution, bird, settings, summary, part, learnt_yaml)

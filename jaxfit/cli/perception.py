@@ -87,7 +87,7 @@ def reconstruct(options: argparse.Namespace) -> None:
         how = "mapped by their words; `jaxfit track` and `jaxfit fit --names MAP.yaml` use another map"
         show_names(done.names, Path(config.track.keypoints.file).name, how)
     _show_trust(done.tracking, done.tracking.trust.sentence())
-    for track, frames in done.summary.get("labels", {}).get("frames", {}).items():
+    for track, frames in done.summary.get("pose_sources", {}).items():
         show(f"poses of track {track}: {on_what(frames)}")
     show(flag_line(done.solution))
     show(track_table(done.tracking.observations, done.solution))

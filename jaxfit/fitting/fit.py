@@ -308,7 +308,7 @@ def windows_of(observations: Observations, config: FitConfig, source: object) ->
         raise InputError(
             source,
             f"no track has a frame with {config.min_keypoints} confident keypoints",
-            "detect more keypoints, or lower min_keypoints in the config",
+            "detect more keypoints, or lower min_keypoints in the config: with 0, masks are enough",
         )
     return windows
 

@@ -15,9 +15,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfit.config.fit import FitConfig
+from jaxfit.data.observations import MIN_KEYPOINTS
 from jaxfit.fitting.batch import Batch, FittedWindow, fit_batch, frames_per_batch
 from jaxfit.fitting.bodies import Body, estimate_bodies, stages_of_pass
 from jaxfit.fitting.initial_poses import search_initial_poses
+from jaxfit.fitting.outlines import drawn_bodies, match_outlines
 from jaxfit.fitting.solve import FitModel, needs_mask
 from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
 from jaxfit.fitting.tiles import tile_size
@@ -27,6 +29,9 @@ from jaxfit.foundation.workers import Cluster, FailedTask
 from jaxfit.model.kinematics import Pose, rest_pose
 
 _logger = logging.getLogger(__name__)
+
+OUTLINE_PX = 96
+"""Side of the masks whose outlines are matched to orientations."""
 
 
 class Start(NamedTuple):
@@ -119,6 +124,12 @@ def initial_poses_of(windows: Windows, config: FitConfig, model: FitModel) -> Po
     """Return the initial poses of some windows from the file of the fit, or by a search; leading axes W, H."""
     if model.initial_poses is not None:
         return model.initial_poses.window_poses(model.bird, windows, config.common_size)
+    outlines = None
+    if config.min_keypoints < MIN_KEYPOINTS and windows.views is None and windows.has_mask.any():
+        masks, bodies = load_targets(windows, OUTLINE_PX).mask, drawn_bodies(model.bird)
+        pairs = zip(masks, windows.has_mask, strict=True)
+        matches = [match_outlines(own, has_mask, bodies, config.initialise) for own, has_mask in pairs]
+        outlines = jax.tree.map(lambda *x: np.stack(x), *matches)
     return search_initial_poses(
         model.bird,
         model.rig,
@@ -127,6 +138,7 @@ def initial_poses_of(windows: Windows, config: FitConfig, model: FitModel) -> Po
         config.initialise,
         model.camera,
         config.common_size,
+        outlines,
     )
 
 

@@ -50,8 +50,8 @@ def test_a_few_labels_and_masks_become_poses(inputs, tmp_path, capsys):
     assert "poses of track 2: 3 frames on labels; 9 frames on flow" in capsys.readouterr().out
     summary = json.loads((out / "summary.json").read_text())
     assert summary["labels"]["used"] == 3
-    assert summary["labels"]["frames"]["2"] == frames
-    assert summary["labels"]["frames"]["1"] == {"labels": 0, "flow": 0, "the outline alone": FRAMES}
+    assert summary["pose_sources"]["2"] == frames
+    assert summary["pose_sources"]["1"] == {"labels": 0, "flow": 0, "the outline alone": FRAMES}
     assert "poses of track 2" in (out / "report.html").read_text()
     seen = read_coco(out / "observations.json")
     assert np.flatnonzero(seen.keypoint_origin[1] == 1).tolist() == list(LABELLED)

@@ -206,8 +206,7 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
         facts["length of the model"] = f"{length_cm:.1f} cm from bill to tail, measured by the cameras"
     for kind, files in entries("networks"):
         facts[f"network: {kind}"] = ", ".join(f"{name} ({digest[:12]})" for name, digest in files.items())
-    labels = summary.get("labels") or {}
-    for track, frames in (labels.get("frames") or {}).items():
+    for track, frames in entries("pose_sources"):
         facts[f"poses of track {track}"] = on_what(frames)
     facts |= {name: str(version) for name, version in entries("versions")}
     return {
@@ -221,7 +220,7 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
         "seconds": {name: float(seconds) for name, seconds in entries("seconds")},
         "facts": facts,
         "corrections": tuple(map(str, summary.get("corrections") or ())),
-        "label_problems": tuple(map(str, labels.get("problems") or ())),
+        "label_problems": tuple(map(str, (summary.get("labels") or {}).get("problems") or ())),
     }
 
 
