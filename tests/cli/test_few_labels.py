@@ -64,6 +64,20 @@ def test_a_few_labels_and_masks_become_poses(inputs, tmp_path, capsys):
     assert np.median(error_px) < 0.1 * SIDE
 
 
+def test_masks_alone_become_poses(inputs, tmp_path, capsys):
+    search = "  min_keypoints: 0\n  initialise: {method: so3, directions: 20, turns: 8}\n"
+    (inputs / "outlines.yaml").write_text(QUICK.replace("  base: paper\n", "  base: paper\n" + search))
+    given = ["--masks", str(inputs / "masks"), "--model", str(inputs / "toy.npz"), "--out", str(tmp_path / "result")]
+    config = ["--config", str(inputs / "outlines.yaml"), "--keypoints", "none"]
+    assert main(["reconstruct", str(inputs / "frames"), *given, *config]) == 0
+    assert f"poses of track 3: {FRAMES} frames on the outline alone" in capsys.readouterr().out
+    solution, _ = load_solution(tmp_path / "result")
+    assert solution.valid.all()
+    centre = np.array([np.argwhere(mask).mean(0)[::-1] + 0.5 for mask in (masks[0] for masks in FOOTAGE.masks)])
+    middle = solution.keypoints.px[0].mean(1)
+    assert np.linalg.norm(middle - centre, axis=-1).max() < 0.2 * SIDE
+
+
 def test_labels_of_another_film(inputs, tmp_path, capsys):
     write_labels(inputs / "late.csv", {FRAMES + 5: FOOTAGE.keypoints_px[0, 1]})
     rejected(capsys, command(inputs, tmp_path / "result", "late.csv"), "late.csv", alone=False)
