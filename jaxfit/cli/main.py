@@ -23,6 +23,8 @@ STOPPED = 130
 def run() -> NoReturn:
     """Run `main` on the arguments of the terminal and end the process: the installed command."""
     _prepare_streams(verbose=bool({"-v", "--verbose"} & set(sys.argv)))
+    # NumPy's products here are small: with several threads, most of their time is spent waiting for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     received: list[int] = []
 
     def interrupt(number: int, _frame: object) -> None:

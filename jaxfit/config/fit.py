@@ -95,13 +95,14 @@ class CropConfig:
 class InitialiseConfig:
     """The search for initial poses, for a fit without given initial poses."""
 
-    method: Literal["viewing_axis", "so3"] = "viewing_axis"
+    method: Literal["viewing_axis", "so3", "auto"] = "viewing_axis"
     """`viewing_axis`: the bird is seen from above and is rotated about the viewing axis (the paper's method).
-    `so3`: all orientations, for cameras that do not look down."""
+    `so3`: all orientations, for cameras that do not look down. `auto`: `so3` for the tracks whose frames show that the
+    bird is not seen from above, else `viewing_axis`."""
     turns: PositiveInt = 30
     """Number of equal rotations about the viewing axis (30 rotations of 12°)."""
     directions: PositiveInt = 100
-    """Number of viewing directions on the sphere; only for `so3`."""
+    """Number of viewing directions on the sphere; only for `so3` and `auto`."""
     candidates: PositiveInt = 64
     """Number of best orientations per frame from which the sequence of the window is chosen."""
     smoothness: NonNegativeFloat = 400.0

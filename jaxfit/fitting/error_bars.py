@@ -379,13 +379,14 @@ def _covariance(
         keypoints_px: (T, K, 2) the fitted keypoints.
         J: (T, K, 2, P) their derivatives.
     """
-    covariance, misfit = window.covariance.of_frames(), 1.0
+    inverse, misfit = window.covariance(), 1.0
+    covariance = inverse.of_frames()
     present = np.asarray(problem.targets.present, bool)
     noise = _noise(problem)
     if noise is not None:
         error_px, counted = _errors(problem, noise, keypoints_px)
         misfit = _misfit(noise, error_px, counted, _propagate(J, covariance))
-        factor = time_factor(lag_correlations(error_px, counted), fit_correlation(J, window.covariance, present))
+        factor = time_factor(lag_correlations(error_px, counted), fit_correlation(J, inverse, present))
         if factor > 1:
             data = data_blocks(J, counted * noise.precision(error_px), len(window.columns.own))
             covariance = covariance + (factor - 1) * spread(window.precision, covariance, data)

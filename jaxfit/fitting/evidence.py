@@ -223,7 +223,7 @@ def _window_sums(
     if isinstance(posterior, str):
         return None
     # tr(Σ·H): the terms have blocks of single frames, so the blocks of Σ of single frames are enough
-    covariance = posterior.covariance.of_frames()
+    covariance = posterior.covariance().of_frames()
     both = np.concatenate([full[1].own, full[1].shared])
     taken = {name: np.sum(covariance * H[:, both[:, None], both]) for name, H in local.curvature.items()}
     sums = {KEYPOINTS: np.array([2 * local.keypoints, taken[KEYPOINTS], local.energy])}

@@ -12,7 +12,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import FitConfig
@@ -26,6 +26,7 @@ from jaxfit.fitting.crops import square_images
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.learn import Learnt, learn
+from jaxfit.fitting.side_views import seen_from_the_side, single_frame_config
 from jaxfit.fitting.solve import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.tasks import FitTask, fit_windows
@@ -68,7 +69,7 @@ def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[F
     check_memory(source, tables, needed, remedy, max(MAX_TABLE_GB, config.memory_gb))
 
     search = config.initialise
-    orientations = search.turns * search.directions if search.method == "so3" else search.turns
+    orientations = search.turns * search.directions if search.method != "viewing_axis" else search.turns
     candidates = min(search.candidates, orientations)
     # the search compares every orientation with the keypoints, and every candidate with those of the next frame
     search_bytes = 450 * orientations + 12 * candidates**2
@@ -149,7 +150,7 @@ def learn_weights(
     observations = check_observations(observations, bird, source)
     used = config if observations.masks else without_mask_stages(config)
     model = checked_model(observations, bird, [used], initial_poses, source)
-    (windows,) = _windows_of_runs(observations, [used], initial_poses, source)
+    (windows,) = _windows_of_runs(observations, [used], model, source)
     values, remarks = learn(model, used, windows, progress, source)
     config = replace(config, learn_weights=())
     return Learnt(with_values(config, values) if values else config, values, remarks)
@@ -196,7 +197,7 @@ def fit_runs(
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
     model = checked_model(observations, bird, configs, initial_poses, source)
-    windows = _windows_of_runs(observations, configs, initial_poses, source)
+    windows = _windows_of_runs(observations, configs, model, source)
     if select is not None:
         windows = [each[select] for each in windows]
     # each problem is one window of one run
@@ -314,10 +315,12 @@ def windows_of(observations: Observations, config: FitConfig, source: object) ->
 
 
 def _windows_of_runs(
-    observations: Observations, configs: Sequence[FitConfig], initial_poses: InitialPoses | None, source: object
+    observations: Observations, configs: Sequence[FitConfig], model: FitModel, source: object
 ) -> list[Windows]:
     """Return the windows of each config. Configs with an equal `windows_key` share their windows."""
     windows: dict[Hashable, Windows] = {}
+    sides: dict[Hashable, Bool[np.ndarray, "W"]] = {}
+    initial_poses, found = model.initial_poses, []
     for config in configs:
         key = windows_key(config)
         if key not in windows:
@@ -328,7 +331,17 @@ def _windows_of_runs(
                     remedy = "set `overlap: 0` in the config, or leave out --init"
                     raise InputError(initial_poses.source, problem, remedy)
                 initial_poses.check_crops(windows[key])
-    return [windows[windows_key(config)] for config in configs]
+        own = windows[key]
+        if config.initialise.method == "auto" and initial_poses is None:
+            which = key, repr(single_frame_config(config))
+            if which not in sides:
+                sides[which] = seen_from_the_side(own, config, model)
+                tracks, side = (len(np.unique(some)) for some in (own.track, own.track[sides[which]]))
+                text = "seen from the side: all orientations are searched" if side else "seen from above"
+                _logger.info("%d of %d tracks: %s", side or tracks, tracks, text)
+            own = replace(own, all_orientations=sides[which])
+        found.append(own)
+    return found
 
 
 def _fitted_bird(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None) -> Bird:

@@ -290,8 +290,6 @@ class Columns(NamedTuple):
 class Posterior(NamedTuple):
     """The Gaussian approximation of the posterior of one window, and its columns."""
 
-    covariance: Blocks
-    """The blocks of H⁻¹ inside the band. Blocks outside the band are not 0; they are not computed."""
     columns: Columns
     precision: Blocks
     """H, with the broad prior."""
@@ -299,6 +297,10 @@ class Posterior(NamedTuple):
     """The factorisation of H."""
     body: BodySensitivity | None = None
     """How the parameters depend on a body that is given; None for a body that is fixed or optimised."""
+
+    def covariance(self) -> Blocks:
+        """Return the blocks of H⁻¹ inside the band. Blocks outside the band are not 0; they are not computed."""
+        return invert_blocks(self.precision, self.factors)
 
 
 class BodySensitivity(NamedTuple):
@@ -448,7 +450,7 @@ def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -
             factors = factorise(precision)
         except np.linalg.LinAlgError:
             continue
-        return Posterior(invert_blocks(precision, factors), columns, precision, factors)
+        return Posterior(columns, precision, factors)
     return "the curvature of the objective is not positive definite"
 
 

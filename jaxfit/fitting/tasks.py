@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
-from jaxfit.config.fit import FitConfig
+from jaxfit.config.fit import FitConfig, InitialiseConfig
 from jaxfit.data.observations import MIN_KEYPOINTS
 from jaxfit.fitting.batch import Batch, FittedWindow, fit_batch, frames_per_batch
 from jaxfit.fitting.bodies import Body, estimate_bodies, stages_of_pass
@@ -121,36 +121,52 @@ def failed_windows(model: FitModel, config: FitConfig, count: int, failure: str)
 
 
 def initial_poses_of(windows: Windows, config: FitConfig, model: FitModel) -> Pose:
-    """Return the initial poses of some windows from the file of the fit, or by a search; leading axes W, H."""
+    """Return the initial poses of some windows from the file of the fit, or by a search; leading axes W, H.
+
+    Windows with `all_orientations` have the best of all orientations, and last the best seen from above.
+    """
     if model.initial_poses is not None:
         return model.initial_poses.window_poses(model.bird, windows, config.common_size)
-    outlines = None
-    if config.min_keypoints < MIN_KEYPOINTS and windows.views is None and windows.has_mask.any():
-        masks, bodies = load_targets(windows, OUTLINE_PX).mask, drawn_bodies(model.bird)
-        pairs = zip(masks, windows.has_mask, strict=True)
-        matches = [match_outlines(own, has_mask, bodies, config.initialise) for own, has_mask in pairs]
-        outlines = jax.tree.map(lambda *x: np.stack(x), *matches)
-    return search_initial_poses(
-        model.bird,
-        model.rig,
-        windows.keypoints_px,
-        windows.confidence,
-        config.initialise,
-        model.camera,
-        config.common_size,
-        outlines,
-    )
+
+    def search(some: Windows, how: InitialiseConfig) -> Pose:
+        outlines = None
+        if config.min_keypoints < MIN_KEYPOINTS and some.views is None and some.has_mask.any():
+            masks, bodies = load_targets(some, OUTLINE_PX).mask, drawn_bodies(model.bird)
+            pairs = zip(masks, some.has_mask, strict=True)
+            matches = [match_outlines(own, has_mask, bodies, how) for own, has_mask in pairs]
+            outlines = jax.tree.map(lambda *x: np.stack(x), *matches)
+        detections = some.keypoints_px, some.confidence
+        return search_initial_poses(model.bird, model.rig, *detections, how, model.camera, config.common_size, outlines)
+
+    how = config.initialise
+    if how.method != "auto":
+        return search(windows, how)
+    poses = search(windows, replace(how, method="viewing_axis"))
+    if windows.all_orientations is None or not windows.all_orientations.any():
+        return poses
+    rows = np.flatnonzero(windows.all_orientations)
+    found = search(windows[rows], replace(how, method="so3", hypotheses=max(how.hypotheses - 1, 1)))
+
+    def chosen(above: Array, around: Array) -> np.ndarray:
+        result = np.array(above)
+        result[rows] = np.concatenate([around, result[rows, :1]], axis=1)[:, : how.hypotheses]
+        return result
+
+    return jax.tree.map(chosen, poses, found)
 
 
 def gather_batch(model: FitModel, task: FitTask) -> Batch:
     """Return the batch of the problems of a task."""
     mask_px = task.configs[0].crop.size_px if any(map(needs_mask, task.configs[0].stages)) else 0
 
-    def pose_key(config: FitConfig) -> Hashable:
-        """Return the part of the config that determines the windows and their initial poses."""
-        return *windows_key(config), config.initialise, config.common_size
+    def pose_key(r: int) -> Hashable:
+        """Return what determines the windows of a run and their initial poses."""
+        config, around = task.configs[r], task.windows[r].all_orientations
+        return *windows_key(config), config.initialise, config.common_size, None if around is None else around.tobytes()
 
-    targets, targets_row = _prepare_rows(task, windows_key, lambda windows, _: load_targets(windows, mask_px))
+    targets, targets_row = _prepare_rows(
+        task, lambda r: windows_key(task.configs[r]), lambda windows, _: load_targets(windows, mask_px)
+    )
     runs = np.array([r for r, _ in task.problems])
     if task.starts is not None:
         starts = [task.starts[problem] for problem in task.problems]
@@ -162,19 +178,19 @@ def gather_batch(model: FitModel, task: FitTask) -> Batch:
 
 
 def _prepare_rows(
-    task: FitTask, key_of: Callable[[FitConfig], Hashable], prepare: Callable[[Windows, FitConfig], Any]
+    task: FitTask, key_of: Callable[[int], Hashable], prepare: Callable[[Windows, FitConfig], Any]
 ) -> tuple[Any, Int[np.ndarray, "B"]]:
     """Prepare the windows of the B problems of a task. Runs with an equal key share the rows of their windows.
 
     Args:
         task: the problems.
-        key_of: returns the part of a config that determines the result of `prepare`.
+        key_of: returns what determines the result of `prepare` for a run.
         prepare: takes some windows and a config, and returns a pytree with one row for each window.
 
     Returns:
         The concatenated pytrees of all keys, and the row of each problem in them.
     """
-    pairs = [(key_of(task.configs[r]), w) for r, w in task.problems]
+    pairs = [(key_of(r), w) for r, w in task.problems]
     run_of = {key: r for (key, _), (r, _) in zip(pairs, task.problems, strict=True)}
     prepared: list[Any] = []
     row: dict[tuple[Hashable, int], int] = {}

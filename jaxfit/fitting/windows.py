@@ -237,6 +237,8 @@ class Windows:
     """(W,) objects: the `WindowMasks` of each window. `load_targets` reads and decodes the masks."""
     frame_s: Float[np.ndarray, "W"]
     """Time between consecutive frames of the window, in seconds; of a video of 25 frames/s if the rate is unknown."""
+    all_orientations: Bool[np.ndarray, "W"] | None = None
+    """Whether the initial poses are searched among all orientations; None: as `initialise.method` says."""
     views: ViewMaps | None = None
     """The cameras of several views. Then `keypoints_px` and `confidence` hold the keypoints of all views, one view
     after the other, and `has_mask`, `masks` and `crop` have an axis V after T (`masks`: after W)."""
@@ -259,7 +261,8 @@ def window_content(windows: Windows, w: int) -> tuple:
     arrays = windows.frame, windows.present, windows.crop, windows.keypoints_px, windows.confidence, windows.frame_s
     masks: LoadedMasks = cast(Any, windows.masks[w]).load()
     lengths = tuple((tuple(rle["size"]), rle["counts"]) if rle else rle for rle in (*masks.own, *masks.others))
-    return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), lengths
+    around = windows.all_orientations is not None and bool(windows.all_orientations[w])
+    return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), lengths, around
 
 
 def window_hash(windows: Windows, w: int, more: bytes = b"") -> str:

@@ -66,7 +66,7 @@ def test_error_bars_are_those_of_samples_from_the_posterior(narrow):
     columns, frame = np.concatenate([posterior.columns.own, posterior.columns.shared]), 2
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(
-        np.zeros(len(columns)), posterior.covariance.of_frames()[frame], SAMPLES, method="eigh"
+        np.zeros(len(columns)), posterior.covariance().of_frames()[frame], SAMPLES, method="eigh"
     )
     shape = frame_rows(pose, PROGRAM.shared).shape
 

@@ -107,7 +107,7 @@ def test_posterior_of_a_window():
         assert 3 * J + 2 not in each.columns.own  # depth
         assert len(each.columns.own) == 3 * J + 2
         assert len(each.columns.shared) == D - 3 * J - 3
-        sd = np.sqrt(np.einsum("tii->ti", each.covariance.of_frames()))
+        sd = np.sqrt(np.einsum("tii->ti", each.covariance().of_frames()))
         assert np.isfinite(sd).all()
         assert sd[:, : 3 * J].max() < np.pi / np.sqrt(3)
 
@@ -120,7 +120,7 @@ def test_a_bird_with_few_keypoints_has_finite_error_bars(keypoints):
     for confidence in (few, 1.0):
         own = window_posteriors(*fitted(confidence))[0]
         assert not isinstance(own, str)
-        covariance = own.covariance.of_frames()
+        covariance = own.covariance().of_frames()
         assert np.isfinite(covariance).all()
         assert (np.linalg.eigvalsh(covariance) > 0).all()
         orient_sd.append(np.sqrt(np.diagonal(covariance[0])[:3]))
@@ -135,7 +135,7 @@ def test_missing_frames_do_not_count():
     targets = dataclasses.replace(targets, present=present, confidence=targets.confidence * present[..., None])
     own = window_posteriors(program, several._replace(targets=targets), poses)[0]
     assert not isinstance(own, str)
-    angle_sd = np.sqrt(np.diagonal(own.covariance.band[0, -1]))[:3]
+    angle_sd = np.sqrt(np.diagonal(own.covariance().band[0, -1]))[:3]
     np.testing.assert_allclose(angle_sd, np.pi / np.sqrt(3), rtol=1e-4)
 
 

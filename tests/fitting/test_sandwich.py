@@ -79,7 +79,7 @@ def test_error_bars_of_a_constant_pose_are_those_of_many_fits():
     poses = np.tile(deviations, (1, line.frames))
     noise = rng.normal(size=(draws, line.frames)) / np.sqrt(line.noise_precision)
     measured = line.errors(poses, noise).var(axis=0)
-    plain = line.window.covariance.of_frames()
+    plain = line.window.covariance().of_frames()
     present = np.ones(line.frames, bool)
     V, _ = constant_deviation(line.window, line.whitener, 0, line.weight, present)
     wide = plain + V @ V.swapaxes(1, 2)
@@ -112,10 +112,10 @@ def test_noise_that_agrees_between_frames():
     independent = line.errors(zero, white)[:, 5:-5].var(axis=0).mean(axis=0)
     J = np.broadcast_to([[1.0, 0.0], [0.0, 0.0]], (line.frames, 1, 2, 2))
     present = np.ones(line.frames, bool)
-    kappa = fit_correlation(J, line.window.covariance, present)
+    kappa = fit_correlation(J, line.window.covariance(), present)
     factor = time_factor(rho ** np.arange(1, line.frames), kappa)
     data = data_blocks(J, np.full((line.frames, 1), line.noise_precision), 2)
-    found = factor * np.einsum("tii->ti", spread(line.window.precision, line.window.covariance.of_frames(), data))[
+    found = factor * np.einsum("tii->ti", spread(line.window.precision, line.window.covariance().of_frames(), data))[
         5:-5
     ].mean(axis=0)
     assert (measured > 2 * independent).all()
