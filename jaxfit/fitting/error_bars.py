@@ -419,7 +419,7 @@ def window_misfits(
         columns = np.concatenate([posterior.columns.own, posterior.columns.shared])
         points, slope = (np.asarray(each, np.float64) for each in (own.points_cam, own.derivative[..., columns]))
         points_px, J = _in_views(program, problem, points, slope)
-        px_cov = _propagate(J, posterior.covariance.of_frames())
+        px_cov = _propagate(J, posterior.covariance().of_frames())
         factors[b] = _misfit(noise, *_errors(problem, noise, points_px), px_cov)
     return factors
 

@@ -26,7 +26,7 @@ CAMERA = CropCamera(2167.0, 256, 512)
 def config(method="auto", **changes):
     fast = load_config("fast")
     stage = dataclasses.replace(fast.stages[0], steps=8)
-    terms = {"keypoints": 1.0, "pose_prior": 10.0, "velocity": 1.0, "acceleration": 1.0}
+    terms = {"keypoints": 1.0, "pose_prior": 100.0, "velocity": 1.0, "acceleration": 1.0}
     start = dataclasses.replace(fast.initialise, method=method, turns=15, directions=60)
     plain = dataclasses.replace(fast, window=6, filter_window=1, stages=(stage,), terms=terms, initialise=start)
     return dataclasses.replace(plain, **changes)
@@ -72,7 +72,7 @@ def test_a_film_from_above_has_the_same_result_and_says_so(caplog):
 
 
 def test_all_orientations_are_searched_for_birds_from_the_side_only(caplog):
-    observed, poses = observe(0, 100, 0, 80)
+    observed, poses = observe(0, 180, 0, 150)
     with caplog.at_level(logging.INFO):
         auto = fit(observed, BIRD, config())
     assert "2 of 4 tracks: seen from the side: all orientations are searched" in caplog.text
@@ -84,7 +84,7 @@ def test_all_orientations_are_searched_for_birds_from_the_side_only(caplog):
 
 
 def test_the_best_pose_from_above_stays_a_hypothesis():
-    observed, _ = observe(100, 0)
+    observed, _ = observe(180, 0)
     how = dataclasses.replace(config(), initialise=dataclasses.replace(config().initialise, hypotheses=2))
     windows, model = windows_of(observed, how, "test"), model_of_fit(BIRD, how)
     side = windows.track == 0
@@ -101,13 +101,13 @@ def test_the_best_pose_from_above_stays_a_hypothesis():
 
 @pytest.mark.parametrize("frames", [1, 3])
 def test_short_tracks(frames):
-    observed, _ = observe(0, 100, frames=frames)
+    observed, _ = observe(0, 180, frames=frames)
     assert decided(observed) == [False, True]
 
 
 def test_wrong_keypoints_of_one_frame_do_not_decide():
-    """The keypoints of another bird, seen from the side, stand in one of eight frames."""
-    observed, _ = observe(0, 100)
+    """The keypoints of another bird, seen from below, stand in one of eight frames."""
+    observed, _ = observe(0, 180)
     points = observed.keypoints_px.copy()
     points[0, 0] = points[1, 0] - points[1, 0].mean(0) + points[0, 0].mean(0)
     wrong = observed.with_keypoints(points, observed.confidence)
@@ -118,13 +118,13 @@ def test_wrong_keypoints_of_one_frame_do_not_decide():
 
 def test_the_decision_does_not_depend_on_scales():
     """An objective in other units, as squared pixels, and larger noise than the config assumes."""
-    observed, _ = observe(0, 100)
+    observed, _ = observe(0, 180)
     times = {name: 1000 * weight for name, weight in config().terms.items()}
     assert decided(observed, config(terms=times)) == [False, True]
 
 
 def test_tracks_without_confident_keypoints():
-    observed, _ = observe(0, 100)
+    observed, _ = observe(0, 180)
     confidence = observed.confidence.copy()
     confidence[1] = 0
     some = observed.with_keypoints(observed.keypoints_px, confidence)
@@ -135,7 +135,7 @@ def test_tracks_without_confident_keypoints():
 
 
 def test_runs_of_a_sweep_decide_for_themselves():
-    observed, _ = observe(0, 100)
+    observed, _ = observe(0, 180)
     other = {name: 3 * weight for name, weight in config().terms.items()}
     sweep = [config(), config("viewing_axis"), config(terms=other)]
     for solution, how in zip(fit_runs(observed, BIRD, sweep), sweep, strict=True):
