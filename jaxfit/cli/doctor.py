@@ -152,17 +152,18 @@ def _networks() -> Iterator[Finding]:
 
 
 def _general_segmenter() -> Finding:
-    from jaxfit.perception.general_networks import general_files
+    from jaxfit.perception.general_networks import COMMAND, general_files, installed_general
     from jaxfit.perception.segmentation import load_segmenter
 
     name = "general segmenter"
-    if not any(path.exists() for path in general_files()):
-        return Finding(name, "not installed", "for birds of any species: jaxfit networks get general", optional=True)
+    installed = installed_general()
+    if installed is None and not any(path.exists() for path in general_files()):
+        return Finding(name, "not installed", f"for birds of any species: {COMMAND}", optional=True)
     try:
-        load_segmenter("general")
+        load_segmenter(installed or "general")
     except InputError as error:
         return Finding(name, f"{error.source}: {error.problem}", error.remedy)
-    return Finding(name, "loads")
+    return Finding(name, f"`{installed}` loads")
 
 
 def _optional_packages() -> Iterator[Finding]:

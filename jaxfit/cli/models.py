@@ -42,8 +42,8 @@ def networks_get(options: argparse.Namespace) -> None:
     from jaxfit.foundation.progress import terminal
     from jaxfit.perception.general_networks import get_general_files
 
-    files = get_general_files(options.source, terminal)
-    show(f"{options.name}: {', '.join(map(str, files))}; `--segmenter auto` compares this segmenter from now on")
+    files = get_general_files(options.name, options.source, terminal)
+    show(f"{options.name}: {', '.join(map(str, files))}; `--segmenter auto` may use these networks from now on")
 
 
 def model_info(options: argparse.Namespace) -> None:

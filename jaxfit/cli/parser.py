@@ -269,6 +269,8 @@ def _overlay(command: Parser) -> None:
 def _track(command: Parser) -> None:
     """Detect and track the birds of a video and their keypoints."""
     add_tracking_options(command)
+    text = "VIDEO is a folder of photographs: search the bird of each picture, without tracks"
+    command.add_argument("--photographs", action="store_true", help=text)
     add_out(command, "OBS.json", "COCO file to write", overwrite="an existing file")
     add_cluster(command, "run the networks")
 
@@ -390,8 +392,8 @@ def _model_get(command: Parser) -> None:
 @_command("cameras and models", "networks get", "models.networks_get")
 def _networks_get(command: Parser) -> None:
     """Download published networks."""
-    text = "the segmenter of birds of any species: YOLOX-nano and U²-Net-p (Apache-2.0 licence, 8.2 MB)"
-    command.add_argument("name", choices=("general",), help=text)
+    text = "the segmenter of birds of any species, U²-Net-p with YOLOX-nano (8.2 MB), YOLOX-tiny (25 MB) or YOLOX-s "
+    command.add_argument("name", choices=("general", "general-tiny", "general-s"), help=f"{text}(40 MB); Apache-2.0")
     command.shared("--from")
 
 

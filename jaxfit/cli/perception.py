@@ -7,7 +7,9 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
 
 from jaxfit.cli.observations import show_names
 from jaxfit.cli.tables import flag_line, right_aligned, show, track_table
@@ -25,6 +27,7 @@ def track(options: argparse.Namespace) -> None:
     from jaxfit.data.formats.coco import write_coco
     from jaxfit.foundation.files import check_writable
     from jaxfit.foundation.workers import open_cluster
+    from jaxfit.perception.photographs import track_photographs
     from jaxfit.perception.track import run_tracking
     from jaxfit.view.overlay import check_outputs
 
@@ -33,18 +36,26 @@ def track(options: argparse.Namespace) -> None:
         check_outputs([options.out], options.video, options.overwrite)  # before the long work
     check_writable(options.out)
     config = reconstruct_config(options).track
-    with open_cluster(options.workers, options.scheduler) as cluster:
-        tracking = run_tracking(options.video, config, progress=terminal, cluster=cluster)
+    if options.photographs:
+        tracking = track_photographs(options.video, config, terminal)
+    else:
+        with open_cluster(options.workers, options.scheduler) as cluster:
+            tracking = run_tracking(options.video, config, progress=terminal, cluster=cluster)
     write_coco(tracking.observations, options.out, tracking.info())
     if tracking.failure:
         _show_failure(tracking, config.min_track_frames)
     else:
         _show_trust(tracking, tracking.trust.sentence())
-        show(track_table(tracking.observations))
+        if options.photographs:
+            _show_photographs(tracking)
+        else:
+            show(track_table(tracking.observations))
         _show_skipped_tracks(tracking, config.min_track_frames)
     tracks, frames = tracking.observations.present.shape
-    seconds = time.perf_counter() - start
-    show(f"{counted(tracks, 'track')} over {counted(frames, 'frame')} in {seconds:.1f} s → {options.out}")
+    seconds, what = time.perf_counter() - start, f"{counted(tracks, 'track')} over {counted(frames, 'frame')}"
+    if options.photographs:
+        what = f"{counted(tracks, 'bird')} in {counted(tracking.observations.photographs, 'photograph')}"
+    show(f"{what} in {seconds:.1f} s → {options.out}")
     if tracking.failure:
         raise tracking.failure  # last, because it says what to do next
 
@@ -116,16 +127,20 @@ def reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
 
 
 def _show_trust(tracking: TrackingResult, judgement: str) -> None:
-    """Print which segmenter `auto` chose, and the judgement of the video.
-
-    Without a comparison of the segmenters, the line about the segmenter is a hint, which follows low trust.
-    """
-    choice = tracking.choice
-    if choice and choice.is_compared:
-        show(choice.sentence())
+    """Print which segmenter `auto` chose, and the judgement of the video."""
+    if tracking.choice and tracking.choice.is_compared:
+        show(tracking.choice.sentence())
     show(judgement)
-    if choice and not choice.is_compared and tracking.trust.level == "low":
-        show(choice.sentence())
+
+
+def _show_photographs(tracking: TrackingResult) -> None:
+    """Print the birds of photographs."""
+    birds = tracking.observations
+    table = right_aligned("score", "length px")
+    table.add_column("photograph")
+    for n, score in enumerate(cast(np.ndarray, birds.score)[:, 0].tolist()):
+        table.add_row(f"{score:.2f}", f"{birds.box_px[n, 0, 2:].max():.0f}", birds.image_file(n, 0))
+    show(table)
 
 
 def _show_failure(tracking: TrackingResult, min_frames: int) -> None:
@@ -142,7 +157,7 @@ def _show_skipped_tracks(tracking: TrackingResult, min_frames: int) -> None:
         show(f"{counted(len(short), 'track')} with fewer than {min_frames} frames skipped: {frames}")
     if low:
         scores = _some(f"{track} ({score:.2f})" for track, score in low.items())
-        show(f"{counted(len(low), 'track')} with a low mean score skipped (--min-track-score): {scores}")
+        show(f"{counted(len(low), 'track')} with low scores skipped (--min-track-score, --min-score): {scores}")
 
 
 def _some(texts: Iterable[str]) -> str:

@@ -39,9 +39,10 @@ class SegmenterConfig:
     """The network that detects birds in a frame."""
 
     file: str = AUTO
-    """Network that detects birds: `builtin` (for murres, trained on simulated footage), `general` (for all birds; two
-    files that the user downloads), `auto` (one of both, by eight frames; without the two files, `builtin`), an ONNX
-    file, or `detector.onnx+saliency.onnx`."""
+    """Network that detects birds: `builtin` (for murres, trained on simulated footage); `general`, `general-tiny` or
+    `general-s` (for all birds; two files that the user downloads); `auto` (`builtin` where trust in it is high on eight
+    frames, or else a general network that is downloaded and detects a bird); an ONNX file; or
+    `detector.onnx+saliency.onnx`."""
     kind: str = "auto"
     """Layout of the network's output: bottom_up, rf_detr, mask_rcnn, yolo, yolox+saliency; `auto` infers the layout
     from the file."""

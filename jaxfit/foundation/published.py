@@ -68,8 +68,8 @@ def get_published(
         The paths of the files.
 
     Raises:
-        InputError: a file cannot be downloaded, or has another content than the published file. Files that were
-            complete before stay, so that the same command continues.
+        InputError: a file cannot be downloaded, or has another content than the published file. The same call
+            continues: complete files stay, and so does the part of a file whose download broke off.
     """
     paths = [folder / published.file_name for published in files]
     for path, published in zip(paths, files, strict=True):
@@ -88,13 +88,28 @@ def _download(published: PublishedFile, path: Path, progress: ProgressTask) -> N
     import requests
 
     pooch.get_logger().setLevel("WARNING")
+    part = path.with_name(f"{path.name}.part")
     with progress(f"download of {path.name}", None) as report_progress:
-        bar: Any = _Bar(report_progress)  # pooch's types allow a bool only, its documents a bar too
-        downloader: Any = pooch.HTTPDownloader(progressbar=bar, timeout=_SECONDS)
+
+        def download(url: str, output_file: str, _: object) -> None:
+            """Write the bytes that are missing; an interrupted download leaves `part`."""
+            done = part.stat().st_size if part.exists() else 0
+            headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={done}-"} if done else {})
+            with requests.get(url, headers=headers, stream=True, timeout=_SECONDS) as response:
+                if response.status_code == requests.codes.requested_range_not_satisfiable:
+                    part.unlink()
+                response.raise_for_status()
+                continues = response.status_code == requests.codes.partial_content
+                done = done if continues else 0
+                report_progress(done, f"{done / 1e6:.1f} MB")
+                with part.open("ab" if continues else "wb") as file:
+                    for block in response.iter_content(1 << 16):
+                        done += file.write(block)
+                        report_progress(len(block), f"{done / 1e6:.1f} MB")
+            part.replace(output_file)
+
         try:
-            pooch.retrieve(
-                published.url, f"sha256:{published.sha256[0]}", path.name, path.parent, downloader=downloader
-            )
+            pooch.retrieve(published.url, f"sha256:{published.sha256[0]}", path.name, path.parent, downloader=download)
         except ValueError as error:
             problem = "gave another file than the published one: its SHA-256 differs"
             remedy = f"try `{published.command}` later, or give a folder with the right file by --from"
@@ -104,23 +119,7 @@ def _download(published: PublishedFile, path: Path, progress: ProgressTask) -> N
             reason = "the connection broke off" if broken else "no connection"
             if isinstance(error, requests.exceptions.HTTPError) and error.response is not None:
                 reason = f"the server answers {error.response.status_code} {error.response.reason}"
-            remedy = f"check the network and run `{published.command}` again, or give a folder with the file by --from"
+            remedy = f"check the network and run `{published.command}` again"
+            remedy += ", which continues" if part.exists() else ""
+            remedy += ", or give a folder with the file by --from"
             raise InputError(published.url, f"cannot be downloaded: {reason}", remedy) from error
-
-
-class _Bar:
-    """The progress bar that pooch asks for."""
-
-    def __init__(self, report_progress: Any):
-        self._report, self._done, self.total = report_progress, 0, 0
-
-    def update(self, count: int) -> None:
-        count = min(count, self.total - self._done) if self.total else count
-        self._done += count
-        self._report(count, f"{self._done / 1e6:.1f} MB")
-
-    def reset(self) -> None:
-        """Pooch resets the bar and then adds the total, which is already there."""
-
-    def close(self) -> None:
-        """Do nothing: the task ends the bar."""

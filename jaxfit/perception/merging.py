@@ -102,20 +102,21 @@ class Tiled:
         self._segmenter, self._tile_px, self._overlap = segmenter, tile_px, overlap
         self.class_names = segmenter.class_names
         self.min_track_score = getattr(segmenter, "min_track_score", 0.0)
+        self.min_best_score = getattr(segmenter, "min_best_score", 0.0)
 
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
         """Segment a frame, as `Segmenter` describes."""
         height, width = frame.shape[:2]
         detections: list[tuple[Instance, _Tile]] = []
-        for y0, y1 in _tile_spans(height, self._tile_px, self._overlap):
-            for x0, x1 in _tile_spans(width, self._tile_px, self._overlap):
+        for y0, y1 in tile_spans(height, self._tile_px, self._overlap):
+            for x0, x1 in tile_spans(width, self._tile_px, self._overlap):
                 instances = self._segmenter(np.ascontiguousarray(frame[y0:y1, x0:x1]))
                 tile = _Tile(x0, y0, x1, y1)
                 detections += [(bird._replace(x0=bird.x0 + x0, y0=bird.y0 + y0), tile) for bird in instances]
         return sorted(_merge(detections), key=lambda instance: -instance.score)
 
 
-def _tile_spans(length: int, tile: int, overlap: float) -> list[tuple[int, int]]:
+def tile_spans(length: int, tile: int, overlap: float) -> list[tuple[int, int]]:
     """Return starts and ends of the smallest number of tiles along one side that have the overlap."""
     if length <= tile:
         return [(0, length)]

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import find_objects
 
-from jaxfit.config.perception import GENERAL
 from jaxfit.foundation.errors import InputError
-from jaxfit.perception.general_networks import check_general_files, general_files
+from jaxfit.perception.general_networks import DETECTORS, check_general_files, general_files
 from jaxfit.perception.merging import Tiled, length_px, replace_parts
 from jaxfit.perception.network import Instance, OnnxModel, Segmenter, activation_monitor
+from jaxfit.perception.saliency import DOUBTFUL_SCORE, DetectorAndSaliency, Saliency
 from jaxfit.perception.segmentation_inputs import Placement, SegmentationNetwork
-from jaxfit.perception.segmentation_layouts import DetectorAndSaliency, MaskRcnn, RfDetrSeg, Saliency, YoloSeg, Yolox
+from jaxfit.perception.segmentation_layouts import MaskRcnn, RfDetrSeg, YoloSeg, Yolox
 
 LONGER_SIDE_PX = 864
 """Default of the metadata `longer_side`, the longer side of the input: 6.9 pixels for 2 cm of a ledge 2.5 m wide."""
@@ -258,9 +258,9 @@ def load_segmenter(
     """Load a segmenter from one or two ONNX files; the inputs and outputs determine its layout.
 
     Args:
-        spec: `builtin`; `general`, whose files `jaxfit.perception.general_networks` describes; or a file; or two files
-            as `detector.onnx+saliency.onnx`: a YOLOX detector, and a network such as U²-Net that segments the salient
-            object in each box.
+        spec: `builtin`; a general segmenter (`general`, `general-tiny`, `general-s`), whose files
+            `jaxfit.perception.general_networks` describes; or a file; or two files as `detector.onnx+saliency.onnx`: a
+            YOLOX detector, and a network such as U²-Net that segments the salient object in each box.
         kind: one of `KINDS`; a name requires this layout, `auto` uses the layout that fits.
         classes: names of the classes to keep; None keeps `bird`, or the only class.
         min_score: least score of an instance, within [0, 1]; None uses the default of the layout.
@@ -285,9 +285,9 @@ def load_segmenter(
 
 
 def segmenter_files(spec: str) -> list[Path]:
-    """Return the one or two files of a `spec` of `load_segmenter`; those of `general` are not checked."""
-    if spec == GENERAL:
-        return general_files()
+    """Return the one or two files of a `spec` of `load_segmenter`; those of general segmenters are not checked."""
+    if spec in DETECTORS:
+        return general_files(spec)
     first, plus, second = spec.partition(".onnx+")
     if plus and not Path(spec).is_file():
         return [Path(first + ".onnx"), Path(second)]
@@ -302,7 +302,7 @@ def _load(
     names: Sequence[str] | None,
     threads: int | None,
 ) -> Segmenter:
-    path, *second = check_general_files() if spec == GENERAL else segmenter_files(spec)
+    path, *second = check_general_files(spec) if spec in DETECTORS else segmenter_files(spec)
     if second:
         if kind not in ("auto", "yolox+saliency"):
             raise InputError(spec, f"is two files, but kind {kind} needs one file", "give one file, or kind auto")
@@ -311,7 +311,10 @@ def _load(
             raise _unknown_layout(detector, f"YOLOX detector: {Yolox.layout}")
         if not Saliency.fits(saliency):
             raise _unknown_layout(saliency, "saliency: first output (1, 1, h, w)")
-        return DetectorAndSaliency(Yolox(detector, classes, min_score, names), Saliency(saliency))
+        boxes = Yolox(detector, classes, DOUBTFUL_SCORE if min_score is None else min_score, names)
+        return DetectorAndSaliency(
+            boxes, Saliency(saliency), Yolox.default_min_score if min_score is None else min_score
+        )
     if kind == "yolox+saliency":
         raise InputError(spec, f"is one file, but kind {kind} needs two files", "give detector.onnx+saliency.onnx")
     model = OnnxModel(path, threads)

@@ -1,4 +1,4 @@
-"""Layouts of other projects' networks: YOLO, YOLOX, RF-DETR, Mask R-CNN, boxes with U²-Net masks."""
+"""Layouts of other projects' networks: YOLO, YOLOX, RF-DETR, Mask R-CNN."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.perception.network import Instance, OnnxModel, normalise
 from jaxfit.perception.segmentation_inputs import (
+    GREY,
     STRIDES,
     Placement,
     SegmentationNetwork,
     cell_count,
     coco_by_category,
-    image_input,
     literal_metadata,
     names_of,
     non_maximum_suppression,
@@ -141,6 +141,34 @@ class Detection(NamedTuple):
     label: str
 
 
+class View(NamedTuple):
+    """A way to show a picture to a detector, which knows upright birds of some sizes best."""
+
+    zoom: float = 1.0
+    """At most 1: a smaller picture, in the upper left corner."""
+    turns: int = 0
+    """Quarter turns against the clock."""
+    mirrored: bool = False
+
+    def of(self, picture: UInt8[np.ndarray, "s t 3"]) -> UInt8[np.ndarray, "s2 t2 3"]:
+        """Return the input of a detector in this view."""
+        if self.zoom != 1:
+            small = cv2.resize(picture, None, fx=self.zoom, fy=self.zoom, interpolation=cv2.INTER_AREA)
+            picture = np.full_like(picture, GREY)
+            picture[: small.shape[0], : small.shape[1]] = small
+        picture = np.rot90(picture, self.turns)
+        return picture[:, ::-1] if self.mirrored else picture
+
+    def back(self, corners: Float[np.ndarray, "N 4"], side_px: int) -> Float[np.ndarray, "N 4"]:
+        """Return the boxes of the original input, which is a square if the view has turns."""
+        x0, y0, x1, y1 = corners.T
+        if self.mirrored:
+            x0, x1 = side_px - x1, side_px - x0
+        for _ in range(self.turns):
+            x0, y0, x1, y1 = side_px - y1, x0, side_px - y0, x1
+        return np.stack([x0, y0, x1, y1], 1) / self.zoom
+
+
 class Yolox(SegmentationNetwork):
     """Boxes on three grids, in the encoding of the network.
 
@@ -160,6 +188,7 @@ class Yolox(SegmentationNetwork):
     def _set_up(self) -> None:
         self._size_px = self._input.size_px or _DEFAULT_INPUT_PX
         self._cells, self._strides = _grid(self._size_px)
+        self.is_square = self._size_px[0] == self._size_px[1]
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
         return names_of(self._model, names, (self._model.outputs[0].shape[2] or 0) - 5)
@@ -175,10 +204,22 @@ class Yolox(SegmentationNetwork):
         height, width = expected[2:]
         return None in (head[1], height, width) or head[1] == cell_count((width or 0, height or 0))
 
-    def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Detection]:
-        """Detect boxes in a blue-green-red frame; return them by falling score."""
+    def __call__(self, frame: UInt8[np.ndarray, "H W 3"], *views: View) -> list[Detection]:
+        """Detect boxes in the views of a blue-green-red frame (by default as it is); return them by falling score."""
         placement = Placement.letterboxed((frame.shape[1], frame.shape[0]), self._size_px, centred=False)
-        outputs = self._model(self._input.array(placement.picture(frame).astype(np.float32)))
+        picture = placement.picture(frame)
+        found = [self._boxes(picture, view, placement) for view in views or (View(),)]
+        corners_px, scores, labels = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return [
+            Detection(corners_px[i], float(scores[i]), self._classes[int(labels[i])])
+            for i in non_maximum_suppression(corners_px, scores, labels, self.max_iou)
+        ]
+
+    def _boxes(
+        self, picture: UInt8[np.ndarray, "s t 3"], view: View, placement: Placement
+    ) -> tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N"], Int[np.ndarray, "N"]]:
+        """Return corners in the frame, scores and classes of the boxes in a view, with duplicates."""
+        outputs = self._model(self._input.array(view.of(picture).astype(np.float32)))
         port = self._model.outputs[0]
         self._model.check_outputs(outputs, {port.name: (1, len(self._cells), port.shape[2])})
         (head,) = outputs.values()
@@ -190,11 +231,8 @@ class Yolox(SegmentationNetwork):
         is_kept &= np.isfinite(rows[:, :4]).all(1) & (rows[:, 2:4] < _LARGEST_VALUE).all(1)
         rows, scores, labels, strides = rows[is_kept], scores[is_kept], labels[is_kept], self._strides[is_kept]
         centre, half = (rows[:, :2] + self._cells[is_kept]) * strides, np.exp(rows[:, 2:4]) * strides / 2
-        corners_px = placement.to_frame(np.concatenate([centre - half, centre + half], 1))
-        return [
-            Detection(corners_px[i], float(scores[i]), self._classes[int(labels[i])])
-            for i in non_maximum_suppression(corners_px, scores, labels, self.max_iou)
-        ]
+        corners = view.back(np.concatenate([centre - half, centre + half], 1), self._size_px[0])
+        return placement.to_frame(corners), scores, labels
 
 
 def _grid(size_px: tuple[int, int]) -> tuple[Float[np.ndarray, "cells 2"], Float[np.ndarray, "cells 1"]]:
@@ -346,108 +384,3 @@ class MaskRcnn(SegmentationNetwork):
 
 def _reduced(frame_px: tuple[int, int], zoom: float) -> tuple[int, int]:
     return max(1, round(frame_px[0] * zoom)), max(1, round(frame_px[1] * zoom))
-
-
-# margins on each side of a box, as shares of its sides:
-CONTEXT = 0.25  # of the picture for the saliency network, which needs background around the object
-MASK_MARGIN = 0.05  # of the mask, because boxes are seldom exact
-_SALIENCY_INPUT_PX = (320, 320)
-
-
-class Saliency:
-    """Probability that a pixel belongs to the salient object of a picture, the first output of U²-Net.
-
-    Input (1, 3, h, w): the picture stretched to the input, divided by its largest value, red-green-blue, normalised
-    with ImageNet's mean and standard deviation; 320 x 320 for an input of variable size. First output (1, 1, h, w):
-    probabilities. The outputs of coarser stages are not used.
-
-    Raises:
-        InputError: an unsupported input.
-
-    Source: Qin et al. 2020, U²-Net; `ToTensorLab` of https://github.com/xuebinqin/U-2-Net (Apache-2.0).
-    """
-
-    def __init__(self, model: OnnxModel):
-        self._model = model
-        self._input = image_input(model)
-        self.size_px = self._input.size_px or _SALIENCY_INPUT_PX
-
-    @staticmethod
-    def fits(model: OnnxModel) -> bool:
-        """Whether the shapes of a network have this layout."""
-        shape = model.outputs[0].shape
-        return len(model.inputs) == 1 and len(shape) == 4 and shape[1] == 1
-
-    def __call__(self, picture: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
-        """Compute the probabilities over a blue-green-red picture of `size_px`."""
-        rgb = picture[..., ::-1].astype(np.float32) / max(1, int(picture.max()))
-        outputs = self._model(self._input.array(normalise(rgb)))
-        name = self._model.outputs[0].name
-        self._model.check_outputs(outputs, {name: (1, 1, "h", "w")})
-        return outputs[name][0, 0].astype(np.float32)
-
-
-class DetectorAndSaliency:
-    """A segmenter of a detector and a saliency network.
-
-    A mask is the part of the largest connected component within the slightly enlarged box. Birds that occlude each
-    other within one box share a mask. A box without a salient object gives no instance.
-
-    Args:
-        detector: detects the boxes and their scores.
-        saliency: computes the masks.
-    """
-
-    def __init__(self, detector: Yolox, saliency: Saliency):
-        self._detector, self._saliency = detector, saliency
-        self.class_names = detector.class_names
-
-    def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
-        """Segment a frame, as `Segmenter` describes."""
-        instances = []
-        for corners_px, score, label in self._detector(frame):
-            instance = self.instance_in_box(frame, corners_px)
-            if instance is not None:
-                instances.append(instance._replace(score=score, label=label))
-        return instances
-
-    def boxes(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Float[np.ndarray, "4"]]:
-        """Return the boxes of the detector: x0, y0, x1, y1 in image pixels."""
-        return [corners_px for corners_px, _, _ in self._detector(frame)]
-
-    def instance_in_box(
-        self, frame: UInt8[np.ndarray, "H W 3"], corners_px: Float[np.ndarray, "4"], margin: float = MASK_MARGIN
-    ) -> Instance | None:
-        """Segment the salient object in a box, with the score 1.
-
-        Args:
-            frame: blue, green, red.
-            corners_px: x0, y0, x1, y1 in image pixels.
-            margin: margin of the box that the mask may cover, as a share of the sides of the box.
-
-        Returns:
-            The instance; None for a box outside the frame or without a salient object.
-        """
-        frame_px = (frame.shape[1], frame.shape[0])
-        crop_px = _enlarge(corners_px, CONTEXT, frame_px)
-        if (crop_px[:2] >= crop_px[2:]).any():  # a box outside the frame
-            return None
-        placement = Placement.cropped(frame_px, self._saliency.size_px, crop_px)
-        probability = self._saliency(placement.picture(frame))
-        enlarged_px = _enlarge(corners_px, margin, frame_px)
-        label = self.class_names[0] if self.class_names else "bird"
-        return placement.instance(probability, enlarged_px, 0.5, 1.0, label, keep=_largest_component)
-
-
-def _enlarge(corners_px: Float[np.ndarray, "4"], share: float, frame_px: tuple[int, int]) -> Int[np.ndarray, "4"]:
-    """Add margins to a box, round outwards to whole pixels, and clip to the frame."""
-    margin = np.tile(corners_px[2:] - corners_px[:2], 2) * share * [-1, -1, 1, 1]
-    low, high = np.floor(corners_px + margin)[:2], np.ceil(corners_px + margin)[2:]
-    return np.clip(np.concatenate([low, high]), 0, np.tile(frame_px, 2)).astype(int)
-
-
-def _largest_component(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    _, components, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    if len(stats) == 1:
-        return mask
-    return components == 1 + stats[1:, cv2.CC_STAT_AREA].argmax()

@@ -17,7 +17,7 @@ from jaxfit.data.formats.image_sizes import add_times, check_video
 from jaxfit.data.formats.mask_files import mask_observations
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.observations import Observations
-from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import Clock, ProgressTask, silent
 from jaxfit.foundation.unfinished import Parts
 from jaxfit.foundation.workers import Cluster
@@ -56,7 +56,8 @@ class TrackingResult(NamedTuple):
     short_tracks: dict[int, int]
     """Track → number of frames, for the excluded short tracks."""
     low_score_tracks: dict[int, float]
-    """Track → mean score, for the excluded longer tracks of birds with low scores."""
+    """Track → mean score, for the excluded longer tracks of birds with low scores: a low mean, or, for segmenters that
+    detect doubtful birds (`min_best_score`), no detection with a certain score."""
     damaged_frames: list[int]
     """Numbers of the frames that could not be read."""
     failure: InputError | None
@@ -181,7 +182,8 @@ def run_tracking(
         length = all_tracks.present.sum(1)  # frames with a detection of the bird, not the frames in between
         score = np.where(all_tracks.present, np.asarray(all_tracks.score), 0).sum(1) / np.maximum(length, 1)
         is_short = length < config.min_track_frames
-        is_low = ~is_short & (score < min_score)
+        best = np.where(all_tracks.present, np.asarray(all_tracks.score), 0).max(1, initial=0)
+        is_low = ~is_short & ((score < min_score) | (best < getattr(segmenter, "min_best_score", 0.0)))
         observations = all_tracks.select(tracks=~is_short & ~is_low)
     ids = all_tracks.track_id
     short_tracks = dict(zip(ids[is_short].tolist(), length[is_short].tolist(), strict=True))
@@ -227,11 +229,12 @@ def _failure(
     """
     low_scores, short_tracks = tracking.low_score_tracks, tracking.short_tracks
     if low_scores:
-        problem = (
-            f"no tracked bird has a mean score of {min_score:g}: the highest of {len(low_scores)} tracks is "
-            f"{max(low_scores.values()):.3f}"
-        )
-        remedy = "lower --min-track-score"
+        tracks, best = counted(len(low_scores), "track"), max(low_scores.values())
+        what, option = f"mean score of {min_score:g}", "--min-track-score"
+        if best >= min_score:  # no detection is certain
+            what, option = "certain detection", "--min-score"
+        problem = f"no tracked bird has a {what}: the highest of {tracks} is {best:.3f}"
+        remedy = f"lower {option}"
     elif short_tracks:
         best_score = max(float(record.score.max(initial=0.0)) for record in records)
         problem = (

@@ -124,7 +124,7 @@ def test_only_low_scores_end_with_what_to_do_next(inputs, tmp_path, networks, ca
     assert main(command(inputs, name, tmp_path / "out", "--min-track-score", "0.95")) == 2
     said = capsys.readouterr()
     assert "trust is high" in said.out
-    assert "3 tracks with a low mean score skipped (--min-track-score)" in said.out
+    assert "3 tracks with low scores skipped (--min-track-score, --min-score)" in said.out
     others, last = caplog.messages, said.err.splitlines()[-1]
     assert "the highest of 3 tracks is 0.900 (lower --min-track-score, label frames (jaxfit suggest), " in last
     stored = [f"{tmp_path}/out.unfinished holds the frames for a lower --min-track-score or --min-track-frames"]

@@ -14,13 +14,19 @@ CONTENT = bytes(range(256)) * 2000
 
 
 class Publisher(BaseHTTPRequestHandler):
-    """Sends the content; under /short, it closes the connection in the middle."""
+    """Sends the content from the byte that is asked for.
+
+    Under /short, it closes the connection in the middle, under /whole it always sends the whole content.
+    """
 
     def do_GET(self):
-        self.send_response(200 if self.path != "/missing" else 404)
-        self.send_header("Content-Length", str(len(CONTENT)))
+        asked = self.headers.get("Range")
+        start = 0 if asked is None or self.path == "/whole" else int(asked.removeprefix("bytes=").removesuffix("-"))
+        found = 416 if start >= len(CONTENT) else 206 if start else 200
+        self.send_response(found if self.path != "/missing" else 404)
+        self.send_header("Content-Length", str(len(CONTENT) - start))
         self.end_headers()
-        self.wfile.write(CONTENT[: 1000 if self.path == "/short" else None])
+        self.wfile.write(CONTENT[start : 1000 if self.path == "/short" else None])
 
     def log_message(self, *_):
         """Print nothing."""
@@ -58,13 +64,37 @@ def test_a_download_and_its_progress(address, tmp_path):
     [
         ("/net.onnx", b"another", "SHA-256 differs"),
         ("/missing", CONTENT, "the server answers 404"),
-        ("/short", CONTENT, "the connection broke off"),
     ],
 )
 def test_a_failed_download_leaves_nothing(address, tmp_path, place, content, words):
     with pytest.raises(InputError, match=rf"(?s){place}: .*{words}.*--from"):
         get_published([published(address + place, content)], tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("place", "received"), [("/net.onnx", len(CONTENT) - 1000), ("/whole", len(CONTENT))])
+def test_a_broken_download_continues(address, tmp_path, place, received):
+    with pytest.raises(InputError, match=r"the connection broke off.*again, which continues, or give a folder"):
+        get_published([published(f"{address}/short")], tmp_path)
+    (part,) = tmp_path.iterdir()
+    assert (part.name, part.read_bytes()) == ("net.onnx.part", CONTENT[:1000])
+    steps = []
+
+    @contextmanager
+    def progress(name, total):
+        yield lambda amount, note: steps.append(amount)
+
+    (path,) = get_published([published(address + place)], tmp_path, progress=progress)
+    assert (path.read_bytes(), list(tmp_path.iterdir())) == (CONTENT, [path])
+    assert (sum(steps), sum(steps[1:])) == (len(CONTENT), received)
+
+
+def test_a_part_of_another_file_is_not_kept(address, tmp_path):
+    for length, words in ((2000, "SHA-256 differs"), (len(CONTENT), "the server answers 416")):
+        (tmp_path / "net.onnx.part").write_bytes(b"x" * length)
+        with pytest.raises(InputError, match=words):
+            get_published([published(f"{address}/net.onnx")], tmp_path)
+        assert not list(tmp_path.iterdir())
 
 
 def test_no_network(tmp_path):

@@ -23,12 +23,16 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def files(folder, monkeypatch):
     """Small networks in place of the published ones."""
-    for name, path in (
-        ("DETECTOR", write_yolox(folder / "yolox_nano.onnx", yolox_head(BIRD_ROW))),
-        ("SALIENCY", write_saliency(folder / "u2netp.onnx")),
+    detector = general_networks.DETECTORS["general"]
+    for network, path in (
+        (detector, write_yolox(folder / "yolox_nano.onnx", yolox_head(BIRD_ROW))),
+        (general_networks.SALIENCY, write_saliency(folder / "u2netp.onnx")),
     ):
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        monkeypatch.setattr(general_networks, name, getattr(general_networks, name)._replace(sha256=("0", digest)))
+        network = network._replace(sha256=("0", hashlib.sha256(path.read_bytes()).hexdigest()))
+        if path.name == "u2netp.onnx":
+            monkeypatch.setattr(general_networks, "SALIENCY", network)
+        else:
+            monkeypatch.setitem(general_networks.DETECTORS, "general", network)
     return folder
 
 
@@ -74,6 +78,21 @@ def test_other_files_of_the_same_name(files, name):
         load_segmenter("general")
 
 
+def test_sizes_of_the_detector(files, monkeypatch):
+    assert general_networks.installed_general() == "general"
+    with pytest.raises(InputError, match=r"yolox_s.onnx: does not exist.*run `jaxfit networks get general-s`"):
+        load_segmenter("general-s")
+    # the small network in place of the largest one
+    content = (files / "yolox_nano.onnx").read_bytes()
+    (files / "yolox_s.onnx").write_bytes(content)
+    largest = general_networks.DETECTORS["general-s"]._replace(sha256=(hashlib.sha256(content).hexdigest(),))
+    monkeypatch.setitem(general_networks.DETECTORS, "general-s", largest)
+    assert general_networks.installed_general() == "general-s"
+    assert load_segmenter("general-s", threads=1).class_names == ("bird",)
+    (files / "u2netp.onnx").unlink()
+    assert general_networks.installed_general() is None
+
+
 def test_another_kind_or_class(files):
     with pytest.raises(InputError, match="is two files, but kind yolo needs one file"):
         load_segmenter("general", kind="yolo")
@@ -93,4 +112,17 @@ def test_the_published_files_detect_a_real_bird(reference_dir, monkeypatch, tmp_
     mask = np.zeros_like(true)
     height, width = bird.mask.shape
     mask[bird.y0 : bird.y0 + height, bird.x0 : bird.x0 + width] = bird.mask
-    assert (mask & true).sum() / (mask | true).sum() > 0.7
+    assert (mask & true).sum() / (mask | true).sum() > 0.85
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("pigeons/pigeons_4_1.jpg", "upside down"), ("hawks/0234.jpg", "close"), ("auks/puffin_1.jpg", "large")],
+)
+def test_photographs_that_need_other_views(reference_dir, monkeypatch, tmp_path, name, words):
+    published = reference_dir / "onnx"
+    (tmp_path / "yolox_nano.onnx").symlink_to(published / "yolox_nano_coco.onnx")
+    (tmp_path / "u2netp.onnx").symlink_to(published / "u2netp.onnx")
+    monkeypatch.setenv("JAXFIT_NETWORKS", str(tmp_path))
+    (bird,) = load_segmenter("general", threads=1).photograph(cv2.imread(str(reference_dir / "pictures" / name)))
+    assert bird.score > 0.5, words

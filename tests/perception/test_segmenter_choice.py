@@ -1,4 +1,4 @@
-"""The segmenter that `auto` stands for: agreement by hand, and every reason of a choice, with replaced networks."""
+"""The segmenter that `auto` stands for: every reason of a choice, with replaced networks."""
 
 import logging
 
@@ -9,37 +9,12 @@ from support.toy_footage import FRAMES, SIDE, Footage, TrueKeypoints, TrueSegmen
 
 from jaxfit.config.perception import FramesConfig, SegmenterConfig, TrackConfig
 from jaxfit.foundation.errors import InputError
-from jaxfit.perception import segmenter_choice, track
-from jaxfit.perception.network import instance_of
-from jaxfit.perception.segmenter_choice import agreements, choose_segmenter, with_chosen_segmenter
+from jaxfit.perception import general_networks, segmenter_choice, track
+from jaxfit.perception.segmenter_choice import choose_segmenter, with_chosen_segmenter
 from jaxfit.perception.track import run_tracking
 
 FOOTAGE = Footage()
 AUTO = TrackConfig(min_track_frames=2)
-
-
-def bird(x0, width=10):
-    return instance_of(np.ones((4, width), bool), 0.9, "bird", x0)
-
-
-def test_agreement_by_hand():
-    def of(first, first_mirrored, second=(), second_mirrored=()):
-        return agreements(([first], [first_mirrored]), ([second], [second_mirrored]), (100, 4))
-
-    two = [bird(0), bird(50)]
-    assert of(two, two[::-1], two, two) == (1, 1)
-    assert of([], []) == (0, 0)
-    assert of([bird(0)], []) == (0, 0)
-    assert of([bird(0)], [bird(2)]) == pytest.approx((8 / 12, 0))
-    assert of([bird(0)], [bird(4)]) == (0, 0)  # IoU 6/14
-    assert of(two, [bird(0)]) == pytest.approx((1 / 2, 0))
-    # only the second segmenter detects the other bird in both runs
-    assert of([bird(0)], [bird(0)], two, two) == pytest.approx((1 / 2, 1))
-    # what the second segmenter detects in one run does not count against the first
-    assert of([bird(0)], [bird(0)], two, [bird(0)]) == pytest.approx((1, 1 / 2))
-    # the sums over the frames are divided, not the frames
-    runs = [[bird(0)], [bird(0, 30)]], [[bird(0)], []]
-    assert agreements(runs, ([[], []], [[], []]), (100, 4)) == pytest.approx((10 / 40, 0))
 
 
 class Mirrored(TrueSegmenter):
@@ -79,8 +54,8 @@ def video(tmp_path_factory):
 def networks(monkeypatch, tmp_path):
     """Replace the networks: name → segmenter; the files of the general segmenter exist."""
     opened = {"builtin": Mirrored(), "general": Mirrored()}
-    monkeypatch.setattr(segmenter_choice, "general_files", lambda: [tmp_path])
-    monkeypatch.setattr(segmenter_choice, "check_general_files", lambda: [])
+    monkeypatch.setattr(segmenter_choice, "installed_general", lambda: "general")
+    monkeypatch.setattr(segmenter_choice, "check_general_files", lambda _: [])
     for module in (segmenter_choice, track):
         monkeypatch.setattr(module, "open_segmenter", lambda config, *_: opened[config.segmenter.file])
         monkeypatch.setattr(module, "open_keypoint_detector", lambda _: TrueKeypoints(FOOTAGE))
@@ -97,17 +72,30 @@ def test_high_trust_in_the_builtin_segmenter_decides(video, networks):
 @pytest.mark.parametrize(
     ("builtin", "general", "name", "reason"),
     [
-        ({"missed_in_mirror": FIRST}, {}, "general", "agreement with the mirror image 1.00, builtin 0.67, on 8 frames"),
-        ({}, {"missed_in_mirror": FIRST}, "builtin", "agreement with the mirror image 1.00, general 0.67, on 8 frames"),
-        ({}, {}, "builtin", "agreement with the mirror image 1.00, general 1.00, on 8 frames"),
-        ({"missed": ALL}, {}, "general", "agreement with the mirror image 1.00, builtin 0.00, on 8 frames"),
-        ({}, {"missed": ALL}, "builtin", "the general segmenter detects no bird on 8 frames"),
-        ({"missed": ALL}, {"missed": ALL}, "builtin", "no bird was detected on 8 frames"),
+        # one bird of one frame is enough, and stable masks of the built-in segmenter do not count
+        (
+            {},
+            {"missed": ALL[:-1]},
+            "general",
+            "trust in the built-in segmenter is low on 8 frames, and general detects",
+        ),
+        (
+            {"missed": ALL},
+            {},
+            "general",
+            "trust in the built-in segmenter is low on 8 frames, and general detects birds",
+        ),
+        ({}, {"missed": ALL}, "builtin", "trust is low, but general detects no bird on 8 frames"),
+        # birds that are not detected in the mirror image
+        ({}, {"missed_in_mirror": ALL}, "builtin", "trust is low, but general detects no bird on 8 frames"),
+        ({"missed": ALL}, {"missed": ALL}, "builtin", "trust is low, but general detects no bird on 8 frames"),
     ],
 )
-def test_the_agreement_decides_under_low_trust(video, networks, builtin, general, name, reason):
+def test_under_low_trust_a_bird_of_the_general_segmenter_decides(video, networks, builtin, general, name, reason):
     networks.update(builtin=Mirrored(distance=7.0, **builtin), general=Mirrored(**general))
-    assert choose_segmenter(video, AUTO) == (name, reason, True)
+    choice = choose_segmenter(video, AUTO)
+    assert (choice.segmenter, choice.is_compared) == (name, True)
+    assert choice.reason.startswith(reason)
 
 
 def test_the_frames_are_spread_over_the_range(video, networks):
@@ -125,7 +113,7 @@ def test_tracking_uses_the_chosen_segmenter(video, networks):
     assert found.observations.num_tracks == 3
     assert found.choice.segmenter == "general"
     assert found.info()["segmenter"] == "general"
-    assert found.choice.sentence().startswith("segmenter: general (agreement")
+    assert found.choice.sentence().startswith("segmenter: general (trust in the built-in")
     named = run_tracking(video, TrackConfig(segmenter=SegmenterConfig("builtin"), min_track_frames=2))
     assert (named.choice, named.observations.num_tracks) == (None, 0)
 
@@ -135,20 +123,23 @@ def test_a_segmenter_of_the_caller_needs_no_choice(video, networks):
     assert run_tracking(video, AUTO, Mirrored()).choice is None
 
 
-def test_without_the_files_no_network_runs(video, monkeypatch, tmp_path):
-    monkeypatch.setenv("JAXFIT_NETWORKS", str(tmp_path / "absent"))
-    monkeypatch.setattr(segmenter_choice, "open_segmenter", None)
+@pytest.mark.parametrize(("distance", "trust"), [(7.0, "low"), (0.5, "high")])
+def test_without_the_files_the_command_is_named(video, networks, monkeypatch, caplog, distance, trust):
+    monkeypatch.setattr(segmenter_choice, "installed_general", lambda: None)
+    networks["builtin"] = Mirrored(distance=distance)
+    del networks["general"]  # is not opened
     config, choice = with_chosen_segmenter(video, AUTO)
     assert config == TrackConfig(segmenter=SegmenterConfig("builtin"), min_track_frames=2)
-    assert not choice.is_compared
-    assert choice.info() == {}
-    assert "jaxfit networks get general" in choice.sentence()
+    assert choice.reason.startswith(f"trust is {trust} on 8 frames")
+    for text in (choice.sentence(), choice.info()["segmenter_reason"], "".join(caplog.messages)):
+        assert ("run `jaxfit networks get general` first" in text) == (trust == "low")
 
 
-def test_a_wrong_file_is_reported(video, monkeypatch, tmp_path, caplog):
+def test_a_wrong_file_is_reported(video, networks, monkeypatch, tmp_path, caplog):
+    monkeypatch.setattr(segmenter_choice, "check_general_files", general_networks.check_general_files)
     monkeypatch.setenv("JAXFIT_NETWORKS", str(tmp_path))
     (tmp_path / "yolox_nano.onnx").write_text("<html>")
-    monkeypatch.setattr(segmenter_choice, "open_segmenter", None)
+    networks["builtin"] = Mirrored(distance=7.0)
     with caplog.at_level(logging.WARNING):
         assert choose_segmenter(video, AUTO).segmenter == "builtin"
     (message,) = caplog.messages

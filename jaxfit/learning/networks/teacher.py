@@ -23,7 +23,6 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.optimize import linear_sum_assignment
 
-from jaxfit.config.perception import GENERAL
 from jaxfit.data.masks import box_of_mask, decode_mask, encode_mask
 from jaxfit.evaluation.metrics import iou
 from jaxfit.foundation.array_files import load_npy
@@ -36,10 +35,10 @@ from jaxfit.learning.networks.labels import (
     numbered_by_film,
 )
 from jaxfit.perception.detections import single_opencv_thread
-from jaxfit.perception.general_networks import general_files
+from jaxfit.perception.general_networks import installed_general
 from jaxfit.perception.network import Segmenter
+from jaxfit.perception.saliency import CONTEXT, DetectorAndSaliency
 from jaxfit.perception.segmentation import load_segmenter
-from jaxfit.perception.segmentation_layouts import CONTEXT, DetectorAndSaliency
 from jaxfit.video.reader import probe_video, read_frames
 
 MIN_IOU = 0.5
@@ -177,7 +176,7 @@ def open_teacher(name: str) -> Segmenter | None:
         InputError: a network cannot be used.
     """
     if name == "auto":
-        name = GENERAL if all(path.exists() for path in general_files()) else "none"
+        name = installed_general() or "none"
     return None if name == "none" else load_segmenter(name)
 
 

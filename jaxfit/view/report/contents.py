@@ -204,6 +204,9 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
     if summary.get("measured_length_cm"):
         length_cm = float(summary["measured_length_cm"])
         facts["length of the model"] = f"{length_cm:.1f} cm from bill to tail, measured by the cameras"
+    reasons = list(map(str, summary.get("trust_reasons") or ()))
+    if reasons and "segmenter" in summary:
+        reasons.insert(0, f"segmenter: {summary['segmenter']} ({summary.get('segmenter_reason')})")
     for kind, files in entries("networks"):
         facts[f"network: {kind}"] = ", ".join(f"{name} ({digest[:12]})" for name, digest in files.items())
     for track, frames in entries("pose_sources"):
@@ -216,7 +219,7 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
         "short_tracks": {track: f"{frames:d}" for track, frames in entries("short_tracks")},
         "low_score_tracks": {track: f"{score:.2f}" for track, score in entries("low_score_tracks")},
         "trust": summary.get("trust"),
-        "trust_reasons": tuple(map(str, summary.get("trust_reasons") or ())),
+        "trust_reasons": tuple(reasons),
         "seconds": {name: float(seconds) for name, seconds in entries("seconds")},
         "facts": facts,
         "corrections": tuple(map(str, summary.get("corrections") or ())),
