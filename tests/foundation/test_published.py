@@ -11,6 +11,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.published import PublishedFile, get_published
 
 CONTENT = bytes(range(256)) * 2000
+SHORT = 100_000
 
 
 class Publisher(BaseHTTPRequestHandler):
@@ -26,7 +27,7 @@ class Publisher(BaseHTTPRequestHandler):
         self.send_response(found if self.path != "/missing" else 404)
         self.send_header("Content-Length", str(len(CONTENT) - start))
         self.end_headers()
-        self.wfile.write(CONTENT[start : 1000 if self.path == "/short" else None])
+        self.wfile.write(CONTENT[start : SHORT if self.path == "/short" else None])
 
     def log_message(self, *_):
         """Print nothing."""
@@ -72,12 +73,14 @@ def test_a_failed_download_leaves_nothing(address, tmp_path, place, content, wor
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("place", "received"), [("/net.onnx", len(CONTENT) - 1000), ("/whole", len(CONTENT))])
-def test_a_broken_download_continues(address, tmp_path, place, received):
+@pytest.mark.parametrize("place", ["/net.onnx", "/whole"])
+def test_a_broken_download_continues(address, tmp_path, place):
     with pytest.raises(InputError, match=r"the connection broke off.*again, which continues, or give a folder"):
         get_published([published(f"{address}/short")], tmp_path)
     (part,) = tmp_path.iterdir()
-    assert (part.name, part.read_bytes()) == ("net.onnx.part", CONTENT[:1000])
+    done = part.stat().st_size
+    assert part.name == "net.onnx.part"
+    assert 0 < done <= SHORT
     steps = []
 
     @contextmanager
@@ -86,7 +89,8 @@ def test_a_broken_download_continues(address, tmp_path, place, received):
 
     (path,) = get_published([published(address + place)], tmp_path, progress=progress)
     assert (path.read_bytes(), list(tmp_path.iterdir())) == (CONTENT, [path])
-    assert (sum(steps), sum(steps[1:])) == (len(CONTENT), received)
+    assert steps[0] == (done if place == "/net.onnx" else 0)
+    assert sum(steps) == len(CONTENT)
 
 
 def test_a_part_of_another_file_is_not_kept(address, tmp_path):
