@@ -40,6 +40,8 @@ def networks(monkeypatch):
     monkeypatch.setattr(pipeline, "check_segmenter", lambda _: None)
     for module in (track, pipeline):
         monkeypatch.setattr(module, "open_keypoint_detector", lambda _: TrueKeypoints(FOOTAGE))
+        # the choice of the segmenter has tests of its own
+        monkeypatch.setattr(module, "with_chosen_segmenter", lambda _, config, *__: (config, None))
     monkeypatch.setattr(pipeline, "network_files", lambda _: {})
     return missed
 

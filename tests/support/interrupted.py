@@ -34,6 +34,7 @@ def toy_networks(segmenter):
         mock.patch.object(track, "open_segmenter", return_value=segmenter),
         mock.patch.object(track, "open_keypoint_detector", return_value=TrueKeypoints(FOOTAGE)),
         mock.patch.object(pipeline, "check_segmenter"),
+        mock.patch.object(pipeline, "with_chosen_segmenter", side_effect=lambda _, config, *__: (config, None)),
         mock.patch.object(pipeline, "open_keypoint_detector", return_value=TrueKeypoints(FOOTAGE)),
         mock.patch.object(pipeline, "network_files", return_value={}),
         mock.patch.object(detections, "FRAMES_PER_PART", FRAMES_PER_PART),
