@@ -96,7 +96,7 @@ def test_a_mask_is_not_cut_by_its_box(segmenter, axes):
 
 
 def test_a_mask_is_cut_by_the_boxes_of_other_birds(segmenter):
-    frame = scene((CENTRE, (80, 30)))
+    frame = scene((CENTRE, (80, 28)))
     left, right = segmenter(((120, 170, 200, 230), 0.9), ((200, 170, 280, 230), 0.8))(frame)
     assert left.x0 + left.mask.shape[1] == right.x0 == 200
     assert left.mask.sum() + right.mask.sum() == pytest.approx((frame[..., 2] == 140).sum(), rel=0.03)
