@@ -209,7 +209,7 @@ class DetectorAndSaliency:
             box_px = np.array([bird.x0, bird.y0, bird.x0 + bird.mask.shape[1], bird.y0 + bird.mask.shape[0]])
             # a mask may end at the border of the frame
             if not ((box_px == crop_px) & (crop_px != [0, 0, *frame_px])).any():
-                has_one_part = np.count_nonzero(mask) >= MIN_PART * np.count_nonzero(free)
+                has_one_part = bool(np.count_nonzero(mask) >= MIN_PART * np.count_nonzero(free))
                 return _Segmented(bird, has_one_part, crop_px)
             low, high = np.minimum(box_px, corners_px)[:2], np.maximum(box_px, corners_px)[2:]
             crop_px = _enlarge(np.concatenate([low, high]), CONTEXT, frame_px)
@@ -260,7 +260,8 @@ class DetectorAndSaliency:
             for y0, y1 in tile_spans(picture.shape[0], side_px, CONTEXT):
                 for x0, x1 in tile_spans(picture.shape[1], side_px, CONTEXT):
                     part = self._agreed(np.ascontiguousarray(picture[y0:y1, x0:x1]))
-                    found += [one._replace(corners_px=one.corners_px + np.float32([x0, y0, x0, y0])) for one in part]
+                    corner_px = np.array([x0, y0, x0, y0], np.float32)
+                    found += [one._replace(corners_px=one.corners_px + corner_px) for one in part]
         places: list[list[Detection]] = []
         for one in sorted(found, key=lambda one: -one.score):
             for place in places:

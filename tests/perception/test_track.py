@@ -207,7 +207,7 @@ def test_no_bird_in_the_video(video, monkeypatch, caplog):
         return TrueSegmenter(FOOTAGE, ALL_BIRDS if min_score is None else ALL_BIRDS[:-1])
 
     monkeypatch.setattr(track, "open_segmenter", open_one)
-    config = TrackConfig(segmenter=SegmenterConfig(classes=("duck", "goose"), min_score=0.95))
+    config = TrackConfig(segmenter=SegmenterConfig("general", classes=("duck", "goose"), min_score=0.95))
     with caplog.at_level(logging.WARNING):
         found = track_video(video, config, keypoints=TrueKeypoints(FOOTAGE))
     assert (found.num_tracks, found.num_frames) == (0, FRAMES)
