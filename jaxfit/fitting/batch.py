@@ -145,8 +145,7 @@ def fit_batch(
         run = _stage_run(stage, program, rows, hyperparameters, batch, first)
         parts = []
         for p, tile in run.tiles:
-            pose, keypoints_px = take_tile((rows.pose, final.keypoints_px), tile)
-            evidence, reasons = body_evidence(program, p, pose, keypoints_px)
+            evidence, reasons = body_evidence(program, p, take_tile(rows.pose, tile))
             parts.append(jax.tree.map(lambda *x: np.stack(x), *evidence))
             _report_reasons("a window says nothing about the body of its bird", rows, tile, reasons)
         body = run.joined(parts)

@@ -56,7 +56,7 @@ from itertools import product
 from typing import NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
@@ -146,21 +146,17 @@ def _body_numbers(config: FitConfig) -> tuple[str, ...]:
     return () if config.body_stage is None else shared_parameters(config.stages[config.body_stage])
 
 
-def body_evidence(
-    program: Program, problems: Problem, pose: Pose, keypoints_px: Float[Array, "B T K 2"]
-) -> tuple[list[BodyEvidence], list[str]]:
+def body_evidence(program: Program, problems: Problem, pose: Pose) -> tuple[list[BodyEvidence], list[str]]:
     """Return what each of B windows says about its body, and the reason why it says nothing; empty without a reason.
 
     Args:
         program: the program of the stage that shares the body.
         problems: B problems.
         pose: their optima.
-        keypoints_px: the keypoints of these poses, crop pixels.
     """
-    fitted_px = np.asarray(keypoints_px, np.float64)
     found, reasons = [], []
     posteriors = window_posteriors(program, problems, pose)
-    misfits = window_misfits(program, problems, pose, posteriors)
+    misfits, fitted_px = window_misfits(program, problems, pose, posteriors)
     for b, posterior in enumerate(posteriors):
         values = [np.asarray(getattr(pose, name)[b], np.float64) for name in program.shared]
         mean = np.concatenate(values)

@@ -402,26 +402,34 @@ def _covariance(
 
 def window_misfits(
     program: Program, problems: Problem, pose: Pose, posteriors: Sequence[Posterior | str]
-) -> Float[np.ndarray, "B"]:
-    """Return the misfit factor of each of B problems at their fitted poses; 1 for a problem without a posterior.
+) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B T K 2"]]:
+    """Return the misfit factor of each of B problems at their fitted poses, 1 for a problem without a posterior, and
+    the keypoints of a fit without offsets of keypoints, crop pixels.
 
     Args:
         program, problems, pose: as for `window_error_bars`.
         posteriors: of the problems (`posterior.window_posteriors`).
     """
+    free, without_px = len(program.rig.keypoint_shape_map) - len(program.rig.shape_basis), []
     keypoints = jax.tree.map(np.asarray, _keypoints_and_derivatives(program, problems, pose))
     problems, factors = jax.tree.map(np.asarray, problems), np.ones(len(posteriors))
     for b, posterior in enumerate(posteriors):
         problem, own = jax.tree.map(lambda x, b=b: x[b], (problems, keypoints))
-        noise = _noise(problem)
-        if noise is None or isinstance(posterior, str):
-            continue
-        columns = np.concatenate([posterior.columns.own, posterior.columns.shared])
+        noise, columns = _noise(problem), np.zeros(0, int)
+        if not isinstance(posterior, str):
+            columns = np.concatenate([posterior.columns.own, posterior.columns.shared])
         points, slope = (np.asarray(each, np.float64) for each in (own.points_cam, own.derivative[..., columns]))
         points_px, J = _in_views(program, problem, points, slope)
-        px_cov = _propagate(J, posterior.covariance().of_frames())
-        factors[b] = _misfit(noise, *_errors(problem, noise, points_px), px_cov)
-    return factors
+        without_px.append(points_px)
+        if isinstance(posterior, str):
+            continue
+        covariance = posterior.covariance().of_frames()
+        if noise is not None:
+            factors[b] = _misfit(noise, *_errors(problem, noise, points_px), _propagate(J, covariance))
+        if free:  # the last columns: the other parameters follow them by the regression Cov(x, o)·Cov(o)⁻¹
+            of_offsets = np.linalg.solve(covariance[0, -free:, -free:], np.asarray(pose.betas)[b, -free:])
+            without_px[b] = points_px - np.einsum("tkap,tp->tka", J, covariance[..., -free:] @ of_offsets)
+    return factors, np.stack(without_px)
 
 
 def _errors(
