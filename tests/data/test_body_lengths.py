@@ -16,7 +16,8 @@ BONES, SHAPES = BIRD.num_joints - 1, BIRD.num_shapes
 def bodies_of(bones, betas, bones_sd=0.0, betas_sd=0.0):
     count = len(bones)
     sds = np.full((count, BONES), bones_sd), np.full((count, SHAPES), betas_sd)
-    return Bodies(bones, sds[0], betas, sds[1], np.ones(count), np.ones(count))
+    one = np.ones(count)
+    return Bodies(bones, sds[0], betas, sds[1], one, one, one, np.zeros((count, BIRD.num_keypoints, 3)))
 
 
 def posed_length(bones, betas):

@@ -96,14 +96,15 @@ def test_tracks_that_break_and_change_inside_a_block_are_corrected(rig, straight
     """In camera 1, two tracks exchange their birds in frames 12 to 27; in camera 0, all tracks break at frame 18."""
     cameras, tracks = map(list, zip(*straight, strict=True))
     names = ("present", "keypoints_px", "confidence", "box_px")
+    unknown = dict.fromkeys(("score", "occluded", "keypoint_origin"))
     swapped = {name: getattr(tracks[1], name).copy() for name in names}
     for values in swapped.values():
         values[[0, 1], 12:28] = values[[1, 0], 12:28]
-    tracks[1] = replace(tracks[1], **swapped, masks={}, score=None, occluded=None)
+    tracks[1] = replace(tracks[1], **swapped, masks={}, **unknown)
     broken = {name: np.concatenate([getattr(tracks[0], name)] * 2) for name in names}
     for values in broken.values():
         values[:3, 18:], values[3:, :18] = 0, 0
-    tracks[0] = replace(tracks[0], **broken, track_id=np.arange(6), masks={}, score=None, occluded=None)
+    tracks[0] = replace(tracks[0], **broken, track_id=np.arange(6), masks={}, **unknown)
     matches = match_birds(cameras, tracks)
     assert matches.birds == 3
     true = [np.repeat(true_birds(scene)[:, None], 40, axis=1) for scene in rig.scenes]

@@ -387,7 +387,9 @@ def test_fast_is_paper_with_another_solver():
     stages = (dataclasses.replace(stage, solver="adam", steps=1) for stage in fast.stages)
     without_steps = (dataclasses.replace(stage, steps=1) for stage in paper.stages)
     assert tuple(stages) == tuple(without_steps)
-    assert dataclasses.replace(fast, stages=paper.stages) == paper
+    # and it searches all orientations where birds are not seen from above
+    assert fast.initialise == dataclasses.replace(paper.initialise, method="auto")
+    assert dataclasses.replace(fast, stages=paper.stages, initialise=paper.initialise) == paper
 
 
 @pytest.mark.extended
