@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.body_lengths import body_lengths
 from jaxfit.data.flags import doubt_texts, flags
 from jaxfit.data.world import in_frame_of_camera
 from jaxfit.export.result import CONFIDENCE, ON_LEDGE, SD, TRIANGULATED, Exported
@@ -85,6 +86,10 @@ def _pose_columns(exported: Exported) -> Columns:
         rows = [exported.quality.get(track) for track in s.track_id.tolist()]
         values = [np.nan if row is None or getattr(row, name) is None else getattr(row, name) for row in rows]
         columns[f"track_{name}"] = np.repeat(np.array(values, np.float64), T)
+    if s.bodies is not None:
+        for name, length in body_lengths(exported.bird, s.bodies).items():
+            column = f"body_{name.replace(' ', '_')}"
+            columns |= {column: np.repeat(length.share, T), f"{column}_sd": np.repeat(length.sd, T)}
     columns |= _vectors(exported, {"root": exported.in_image.root * exported.length}, unit)
     columns |= _vectors(exported, {"orientation": exported.in_image.orientation}, "rad")
     if s.error_bars is not None:

@@ -40,6 +40,23 @@ def column(rows, name):
     return np.array([float(row[name] or "nan") for row in rows], np.float32).reshape(3, len(FRAMES))
 
 
+def test_tables_hold_the_lengths_of_the_bodies(folder, tmp_path):
+    made, bird = jaxfit.load_solution(folder)
+    birds, bones, shapes = len(made.track_id), bird.num_joints - 1, bird.num_shapes
+    sizes = {"bone_length": bones, "bone_length_sd": bones, "betas": shapes, "betas_sd": shapes}
+    arrays = {name: np.zeros((birds, size)) for name, size in sizes.items()}
+    arrays |= {"bone_length": np.outer([1, 1.1, np.nan], np.ones(bones)), "keypoint_scale": np.ones(birds)}
+    arrays |= {"frames": np.array([5, 5, np.nan]), "determined": np.array([3, 3, np.nan])}
+    arrays |= {"keypoint_offsets": np.zeros((birds, bird.num_keypoints, 3))}
+    bodies = made.with_arrays(**{f"body_{name}": np.float32(values) for name, values in arrays.items()})
+    jaxfit.save_solution(bodies, bird, "", {}, tmp_path / "result")
+    jaxfit.export_result(tmp_path / "result", "csv", tmp_path / "birds.csv", metres_per_unit=0.02)
+    found = column(rows_of(tmp_path / "birds.csv"), "body_length")
+    np.testing.assert_allclose(found[0], 1, rtol=1e-6)
+    assert (found[1] > 1.02).all()
+    assert np.isnan(found[2]).all()
+
+
 def test_tables_hold_a_row_for_every_bird_and_frame(folder, made, tmp_path):
     jaxfit.export_result(folder, "csv", tmp_path / "birds.csv")
     rows, angles = rows_of(tmp_path / "birds.csv"), rows_of(tmp_path / "birds_angles.csv")
