@@ -91,11 +91,12 @@ def _download(published: PublishedFile, path: Path, progress: ProgressTask) -> N
     part = path.with_name(f"{path.name}.part")
     with progress(f"download of {path.name}", None) as report_progress:
 
-        def download(url: str, output_file: str, _: object) -> None:
-            """Write the bytes that are missing; an interrupted download leaves `part`."""
+        def download(fname: str, action: Any, pooch: Any, *, check_only: bool | None = None) -> None:
+            """Write the bytes of the address `fname` that are missing in the file `action`, with the names of pooch; an
+            interrupted download leaves `part`."""
             done = part.stat().st_size if part.exists() else 0
             headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={done}-"} if done else {})
-            with requests.get(url, headers=headers, stream=True, timeout=_SECONDS) as response:
+            with requests.get(fname, headers=headers, stream=True, timeout=_SECONDS) as response:
                 if response.status_code == requests.codes.requested_range_not_satisfiable:
                     part.unlink()
                 response.raise_for_status()
@@ -106,7 +107,7 @@ def _download(published: PublishedFile, path: Path, progress: ProgressTask) -> N
                     for block in response.iter_content(1 << 16):
                         done += file.write(block)
                         report_progress(len(block), f"{done / 1e6:.1f} MB")
-            part.replace(output_file)
+            part.replace(action)
 
         try:
             pooch.retrieve(published.url, f"sha256:{published.sha256[0]}", path.name, path.parent, downloader=download)
