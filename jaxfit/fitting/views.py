@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import Triangulated, triangulation_sd
-from jaxfit.config.fit import FitConfig, StageConfig
+from jaxfit.config.fit import FitConfig, Learnable, StageConfig
 from jaxfit.data.flags import with_doubts_of_views
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import in_image
@@ -92,9 +92,16 @@ def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
     return replace(
         used,
         stages=tuple(free(stage) for stage in used.stages),
-        learn_weights=() if used.learns_first else used.learn_weights,
+        learn_weights=() if used.learns_first else _learnt_with_bodies(used),
         initialise=replace(used.initialise, hypotheses=1),
     )
+
+
+def _learnt_with_bodies(config: FitConfig) -> tuple[Learnable, ...]:
+    """Return what a fit of several views learns: also the offsets of keypoints, which views tell from bones."""
+    if not config.learn_weights or "betas" not in config.stages[config.body_stage or 0].optimised:
+        return config.learn_weights
+    return tuple(dict.fromkeys((*config.learn_weights, "keypoint_offsets")))
 
 
 def with_unit(views: Views, bird: Bird, source: object = "observations") -> Bird:
