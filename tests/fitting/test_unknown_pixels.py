@@ -110,15 +110,14 @@ def test_a_hidden_half_does_not_shrink_the_bird():
     both = {name: np.repeat(getattr(whole, name), 2, axis=0) for name in ("present", "keypoints_px", "box_px")}
     confidence = np.repeat(whole.confidence, 2, axis=0)
     confidence[1] = 0  # the neighbour is only a mask
-    pair = dataclasses.replace(
-        whole, **both, confidence=confidence, occluded=None, score=None, track_id=np.arange(2), masks=masks
-    )
+    unknown = dict.fromkeys(("occluded", "score", "keypoint_origin"))
+    pair = dataclasses.replace(whole, **both, **unknown, confidence=confidence, track_id=np.arange(2), masks=masks)
     overlap = {}
-    for unknown in (False, True):
+    for skips in (False, True):
         short = tuple(dataclasses.replace(stage, steps=15) for stage in load_config("fast").stages)
-        settings = dataclasses.replace(config(unknown_pixels=unknown), stages=short, window=2)
+        settings = dataclasses.replace(config(unknown_pixels=skips), stages=short, window=2)
         result = fit(pair, bird, settings)
         posed = PosedBirds(result, bird)
         drawn = hard_mask(posed.vertices_screen(0, 0), np.asarray(posed.faces), *pair.image_size(0, 0))
-        overlap[unknown] = iou(drawn, hidden[0])
+        overlap[skips] = iou(drawn, hidden[0])
     assert overlap[True] > max(0.75, overlap[False] + 0.05), overlap
