@@ -234,10 +234,9 @@ class FitConfig:
             require(bool(has_body), at, "is true", "the stage must optimise bone_length or betas")
             later = [stage for stage in self.stages[i + 1 :] if {"bone_length", "betas"} & set(stage.optimised)]
             require(not later, at, "is true", "later stages must not optimise bone_length or betas")
-            free = "betas" in self.stages[i].optimised and "shape_prior" in self.stages[i].terms
             remedy = f"expected betas and shape_prior in the stage {self.stages[i].name}, which `share_body` is in"
-            offsets = free or self.learns_first or "keypoint_offsets" not in self.learn_weights
-            require(offsets, "learn_weights", 'names "keypoint_offsets"', remedy)
+            offsets = "keypoint_offsets" in self.learn_weights and not self.learns_first
+            require(self.can_learn_offsets or not offsets, "learn_weights", 'names "keypoint_offsets"', remedy)
             adam = self.stages[i].solver == "adam" or self.stages[i + 1].carry_moments
             require(not adam, at, "is true", "the stage must use Levenberg-Marquardt")
         for i, stage in enumerate(self.stages):
@@ -256,6 +255,17 @@ class FitConfig:
         """Whether values are learnt from a sample before the fit, and not with the bodies."""
         with_bodies = self.body_stage is not None and "mask_smooth_l1" not in self.learn_weights
         return bool(self.learn_weights) and not with_bodies
+
+    @property
+    def can_learn_offsets(self) -> bool:
+        """Whether offsets of keypoints can be learnt with the bodies: as shape coefficients, with their prior."""
+        stage = None if self.body_stage is None else self.stages[self.body_stage]
+        return stage is not None and "betas" in stage.optimised and "shape_prior" in stage.terms
+
+    @property
+    def learns_offsets(self) -> bool:
+        """Whether the offsets of the keypoints are learnt with the bodies."""
+        return self.can_learn_offsets and not self.learns_first and "keypoint_offsets" in self.learn_weights
 
     @property
     def body_stage(self) -> int | None:

@@ -67,7 +67,7 @@ from jaxfit.fitting.keypoint_offsets import longest_distance, offset_directions
 from jaxfit.fitting.posterior import BROAD_BONE_SD, BROAD_SHAPE_SD, window_posteriors
 from jaxfit.fitting.problem import Problem, Program
 from jaxfit.fitting.sandwich import constant_deviation
-from jaxfit.fitting.solve import FitModel, learns_offsets, shared_parameters
+from jaxfit.fitting.solve import FitModel, shared_parameters
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.posed_window import Priors
@@ -443,7 +443,7 @@ def bodies_of(solution: Solution, bird: Bird, config: FitConfig) -> dict[int, Bo
     known, names, found = solution.bodies, _body_numbers(config), {}
     if known is None or not names:
         return {}
-    directions = offset_directions(bird) if learns_offsets(config) else np.zeros((0, bird.num_keypoints, 3))
+    directions = offset_directions(bird) if config.learns_offsets else np.zeros((0, bird.num_keypoints, 3))
     of_directions = directions.reshape(len(directions), 3 * bird.num_keypoints).T
     for n in np.flatnonzero(np.isfinite(known.frames)).tolist():
         sd = np.concatenate([getattr(known, f"{name}_sd")[n] for name in names] + [np.zeros(len(directions))])

@@ -197,7 +197,7 @@ def fit_model(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None 
     if config.keypoint_offsets:
         offsets = [config.keypoint_offsets.get(name, (0.0, 0.0, 0.0)) for name in bird.keypoint_names]
         rig = move_keypoints(rig, np.array(offsets, np.float32))
-    if learns_offsets(config):
+    if config.learns_offsets:
         directions = offset_directions(bird)
         rig = with_free_keypoints(rig, directions)
         offset_sd = np.full(len(directions), PRIOR_SHARE * longest_distance(bird), np.float32)
@@ -209,13 +209,6 @@ def with_offsets(model: FitModel, pose: Pose) -> Pose:
     """Return a pose with all shape coefficients of the model; offsets of keypoints that it lacks are 0."""
     free = len(model.rig.keypoint_shape_map) - np.shape(pose.betas)[-1]
     return replace(pose, betas=np.pad(pose.betas, [(0, 0)] * (np.ndim(pose.betas) - 1) + [(0, free)]))
-
-
-def learns_offsets(config: FitConfig) -> bool:
-    """Return whether the offsets of the keypoints are learnt with the bodies, as shape coefficients."""
-    if config.body_stage is None or config.learns_first or "keypoint_offsets" not in config.learn_weights:
-        return False
-    return "betas" in config.stages[config.body_stage].optimised
 
 
 def crop_camera(config: FitConfig) -> CropCamera:
@@ -337,7 +330,7 @@ def compiled_part(config: FitConfig) -> FitConfig:
         filter_window=1,
         min_keypoints=1,
         # learnt offsets are further shape coefficients
-        learn_weights=("keypoint_offsets",) if learns_offsets(config) else (),
+        learn_weights=("keypoint_offsets",) if config.learns_offsets else (),
         crop=replace(config.crop, padding=0.0),
         initialise=InitialiseConfig(hypotheses=config.initialise.hypotheses),
     )

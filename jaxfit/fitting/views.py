@@ -99,7 +99,7 @@ def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
 
 def _learnt_with_bodies(config: FitConfig) -> tuple[Learnable, ...]:
     """Return what a fit of several views learns: also the offsets of keypoints, which views tell from bones."""
-    if not config.learn_weights or "betas" not in config.stages[config.body_stage or 0].optimised:
+    if not (config.learn_weights and config.can_learn_offsets):
         return config.learn_weights
     return tuple(dict.fromkeys((*config.learn_weights, "keypoint_offsets")))
 

@@ -282,6 +282,17 @@ def test_slender_birds_have_an_orientation():
     assert np.degrees(Rotation.from_matrix(found @ R.swapaxes(1, 2)).magnitude()).max() < 1
 
 
+def test_several_views_learn_offsets_where_these_have_a_prior():
+    config = load_config("map")
+    assert views_config(config, has_masks=True).learns_offsets
+    assert not config.learns_offsets
+    without = [
+        replace(stage, terms=tuple(name for name in stage.terms if name != "shape_prior")) for stage in config.stages
+    ]
+    for own in (replace(config, stages=tuple(without)), replace(config, learn_weights=())):
+        assert views_config(own, has_masks=True).learn_weights == own.learn_weights
+
+
 def test_views_config_estimates_depth_and_size():
     for name in ("paper", "fast", "map", "photo"):
         config = views_config(load_config(name), has_masks=True)
