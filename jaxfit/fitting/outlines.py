@@ -21,15 +21,15 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxfit.config.fit import InitialiseConfig
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_vertices, rest_pose
+from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_vertices, rest_pose
 from jaxfit.model.rotation import view_grid, viewing_axis_rotations
 
 OUTLINE_KEYPOINTS = 20
@@ -97,13 +97,17 @@ def drawn_bodies(bird: Bird) -> Bodies:
     betas = drawn(rest.betas, np.diag(bird.shape_variance))
     rig = fold_bird(bird)
 
-    @jax.jit
-    def vertices(rig, body_pose, bone_length, betas):
-        pose = replace(rest, body_pose=body_pose, bone_length=bone_length, betas=betas)
-        return posed_vertices(rig, joint_transforms(rig, pose), pose) - rig.joints[0]
-
-    posed = [vertices(rig, *map(jnp.asarray, each)) for each in zip(body_pose, bones, betas, strict=True)]
+    poses = (
+        replace(rest, body_pose=jnp.asarray(angles), bone_length=jnp.asarray(lengths), betas=jnp.asarray(shape))
+        for angles, lengths, shape in zip(body_pose, bones, betas, strict=True)
+    )
+    posed = [_vertices_from_root(rig, pose) for pose in poses]
     return Bodies(np.asarray(posed, np.float64), np.asarray(bird.faces, np.int64))
+
+
+@eqx.filter_jit  # of the module, so that the batches of a fit compile it once
+def _vertices_from_root(rig: Rig, pose: Pose) -> Float[Array, "V 3"]:
+    return posed_vertices(rig, joint_transforms(rig, pose), pose) - rig.joints[0]
 
 
 def match_outlines(
