@@ -10,7 +10,6 @@ from support.toy_footage import BIRD, BIRDS, FRAMES, QUICK, SIDE, Footage
 
 from jaxfit import load_solution, read_coco
 from jaxfit.cli.main import main
-from jaxfit.model.files import save_bird
 
 FOOTAGE, LABELLED = Footage(), (0, 5, 11)
 
@@ -18,9 +17,7 @@ FOOTAGE, LABELLED = Footage(), (0, 5, 11)
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("inputs")
-    FOOTAGE.write(folder / "frames")
-    save_bird(BIRD, folder / "toy.npz")
-    (folder / "quick.yaml").write_text(QUICK)
+    FOOTAGE.write_inputs(folder)
     (folder / "masks").mkdir()
     for t, masks in enumerate(FOOTAGE.masks):
         numbered = [mask.astype(np.uint8) * (n + 1) for n, mask in enumerate(masks)]

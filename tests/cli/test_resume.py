@@ -19,15 +19,12 @@ from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.windows import window_hash
 from jaxfit.foundation import files
 from jaxfit.foundation.errors import InputError
-from jaxfit.model.files import save_bird
 
 FRAME_NUMBERS = list(range(FRAMES))
 
 
 def prepare(folder):
-    FOOTAGE.write(folder / "frames")
-    save_bird(BIRD, folder / "toy.npz")
-    (folder / "quick.yaml").write_text(CONFIG + "overlay: {write: false}\n")
+    FOOTAGE.write_inputs(folder, CONFIG + "overlay: {write: false}\n")
 
 
 def run(folder, point="never", stop=KeyboardInterrupt, *more):

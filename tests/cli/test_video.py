@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from support.cli_files import rejected
 from support.onnx_graphs import write_constant
-from support.toy_footage import BIRD, BIRDS, FRAMES, QUICK, SIDE, Footage, TrueKeypoints, TrueSegmenter
+from support.toy_footage import BIRD, BIRDS, FRAMES, SIDE, Footage, TrueKeypoints, TrueSegmenter
 
 from jaxfit import load_reconstruct_config, load_solution, pipeline, read_coco
 from jaxfit.cli.main import main
 from jaxfit.data.footage import read_footage
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
-from jaxfit.model.files import save_bird
 from jaxfit.perception import track
 from jaxfit.video.reader import probe_video
 
@@ -25,9 +24,7 @@ EVERYONE = [(t, n) for t in range(FRAMES) for n in range(BIRDS)]
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("inputs")
-    FOOTAGE.write(folder / "frames")
-    save_bird(BIRD, folder / "toy.npz")
-    (folder / "quick.yaml").write_text(QUICK)
+    FOOTAGE.write_inputs(folder)
     (folder / "notes.txt").write_text("no video")
     return folder
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from jaxfit.model.camera import CropCamera
+from jaxfit.model.files import save_bird
 from jaxfit.perception.network import instance_of
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
@@ -62,6 +63,12 @@ class Footage:
         for t in range(FRAMES):
             cv2.imwrite(str(folder / f"{t}.png"), self.frame(t))
         return folder
+
+    def write_inputs(self, folder, config=QUICK):
+        """Write the frames, the model and a config, as a command needs them."""
+        self.write(folder / "frames")
+        save_bird(BIRD, folder / "toy.npz")
+        (folder / "quick.yaml").write_text(config)
 
     def birds(self, t):
         return [instance_of(self.masks[t][n], 0.9 - 0.1 * n, "bird", SIDE * n) for n in range(BIRDS)]
