@@ -82,7 +82,7 @@ class Bird(eqx.Module):
 
     @property
     def bone_pairs(self) -> tuple[tuple[int, int], ...]:
-        """(left, right) bones that mirror each other: those that end at the joints of `joint_pairs`."""
+        """(left, right) bones that mirror each other: the bones that end at the joints of `joint_pairs`."""
         # no bone ends at the root
         return tuple((left - 1, right - 1) for left, right in self.joint_pairs if left and right)
 

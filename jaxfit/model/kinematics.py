@@ -184,7 +184,7 @@ def posed_keypoints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Arr
 
 
 def _keypoint_shape(rig: Rig, pose: Pose) -> Float[Array, "K J 3"]:
-    """Return the change of the keypoint map by the coefficients of a pose; those that the pose lacks are 0."""
+    """Return the change of the keypoint map by the coefficients of a pose; missing coefficients are 0."""
     return jnp.tensordot(pose.betas, rig.keypoint_shape_map[: len(pose.betas)], axes=1)
 
 

@@ -370,7 +370,7 @@ def test_fit_finds_the_bones_of_each_bird(fitted):
 
 
 def test_weights_are_learnt_where_the_bodies_are_optimised(fitted):
-    """In the later stages the bodies are known, and their numbers would not count among those that take up errors."""
+    """Later stages have fixed bodies, whose numbers would not count as parameters that absorb errors."""
     learning = dataclasses.replace(CONFIG, learn_weights=("keypoint_likelihood",))
     first, shared, _ = stages()
     one_pass = dataclasses.replace(learning, stages=(first, dataclasses.replace(shared, share_body=False)))

@@ -15,7 +15,7 @@ SHORT = 100_000
 
 
 class Publisher(BaseHTTPRequestHandler):
-    """Sends the content from the byte that is asked for.
+    """Sends the content from the requested byte to the end.
 
     Under /short, it closes the connection in the middle, under /whole it always sends the whole content.
     """
