@@ -26,7 +26,6 @@ MAX_MAPS = 8000
 
 ACCEPTED_SKIPS = (
     r"no \w+ kernels here",  # the processor lacks this instruction set
-    "no Chromium is installed",  # the report is plain HTML, which the other tests parse
     "npm cannot install TypeScript here",  # needs a registry of packages, which no user needs
     "trackers",  # tests/packaging runs these tests in an environment of their own
     UNCHANGED,  # `make release` runs all notebooks and the first hour

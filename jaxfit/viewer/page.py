@@ -7,6 +7,8 @@ import hashlib
 import json
 from pathlib import Path
 
+from jaxfit.view.report.rendering import STYLE
+
 ASSETS = Path(__file__).parent / "assets"
 OWN = ("data", "film", "ledge", "timeline", "corrections", "main")
 """Own modules of the page."""
@@ -16,7 +18,7 @@ CORE = "three.core.min.js"
 """The part of three.js that its module imports by a relative address."""
 FILES = {f"{name}.js": ASSETS / f"{name}.js" for name in OWN}
 FILES |= {name: ASSETS / "three" / name for name in (*LIBRARY.values(), CORE, "LICENSE")}
-FILES["style.css"] = ASSETS / "style.css"
+FILES["style.css"] = STYLE
 _IMPORT_MAP = '<script type="importmap">{}</script>'
 _STYLE = '<link rel="stylesheet" href="page/style.css">'
 _MAIN = '<script type="module" src="page/main.js"></script>'

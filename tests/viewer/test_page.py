@@ -303,6 +303,34 @@ def test_keys_and_the_address(page, browser):
     other.close()
 
 
+def test_the_chosen_bird_is_large_in_both_views_and_panels_have_any_size(page):
+    opened, viewer = page
+    opened.page.keyboard.press("ArrowDown")
+    assert opened.selected() == [11]
+    opened.go(4)
+    view = """(() => { const { canvas, home } = jaxfit.state.columns[0].films[0];
+      return [canvas.width, canvas.height, home.width, home.height, home.x, home.y]; })()"""
+    *canvas, width, height, x, y = opened.page.evaluate(view)
+    points = viewer.results[0].solution.keypoints.px[1, 4]
+    low, high = points.min(0), points.max(0)
+    assert (x, y) == pytest.approx(((low + high) / 2).tolist(), abs=0.1)
+    assert (high - low).max() * min(canvas[0] / width, canvas[1] / height) > 0.6 * min(canvas)
+    opened.until("jaxfit.state.columns[0].ledge.ready")
+    across = """(() => { const view = jaxfit.state.columns[0].ledge, at = view.birds[1].skeleton.bones.map(
+      (bone) => bone.getWorldPosition(view.orbit.position.clone()).project(view.orbit));
+      const span = (axis) => Math.max(...at.map((p) => p[axis])) - Math.min(...at.map((p) => p[axis]));
+      return Math.max(span("x"), span("y")); })()"""
+    assert 0.5 < opened.page.evaluate(across) < 2  # 2 is the whole panel
+    bar = opened.page.locator(".result > .splitter").bounding_box()
+    opened.page.mouse.move(bar["x"] + 2, 300)
+    opened.page.mouse.down()
+    opened.page.mouse.move(bar["x"] - 200, 300)
+    opened.page.mouse.up()
+    opened.until(f"jaxfit.state.columns[0].films[0].canvas.width < {canvas[0]} - 150")
+    opened.page.keyboard.press("?")
+    assert "Play or pause" in opened.page.inner_text("dialog")
+
+
 def test_corrections_and_the_fit_after_them(page, monkeypatch, tmp_path):
     opened, viewer = page
     (tmp_path / "other").mkdir()

@@ -21,6 +21,10 @@ from jaxfit.view.colours import (
 )
 from jaxfit.view.report.axis import duration
 
+TEMPLATES = Path(__file__).parent / "templates"
+STYLE = TEMPLATES / "style.css"
+"""The style sheet of reports and of the viewer."""
+
 
 def rendered(template: str, **values: Any) -> Markup:
     """Return a template of `templates/` with its values."""
@@ -35,7 +39,7 @@ def _visible(value: Any) -> Any:
 
 
 _environment = Environment(
-    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    loader=FileSystemLoader(TEMPLATES),
     autoescape=True,
     finalize=_visible,
     undefined=StrictUndefined,

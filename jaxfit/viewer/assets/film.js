@@ -120,11 +120,15 @@ export class Film {
   }
 }
 
-/** One canvas with the film and the birds of a result. */
+/** One canvas with the film and the birds of a result: the whole picture, or the chosen bird. */
 export class FilmView {
-  /** @param {HTMLElement} parent @param {ResultFacts} facts @param {(track: number, more: boolean) => void} select */
-  constructor(parent, facts, select) {
+  /**
+   * @param {HTMLElement} parent @param {ResultFacts} facts @param {(track: number, more: boolean) => void} select
+   * @param {boolean} follows whether the view shows the chosen bird in place of the whole picture
+   */
+  constructor(parent, facts, select, follows = false) {
     this.facts = facts;
+    this.follows = follows;
     this.canvas = document.createElement("canvas");
     this.message = document.createElement("p");
     this.message.className = "message";
@@ -134,8 +138,12 @@ export class FilmView {
     this.redraw = () => {};
     this.t = -1;
     this.zoom = 1;
-    /** The point of the film in the middle of the canvas. @type {[number, number]} */
-    this.centre = [facts.size_px[0] / 2, facts.size_px[1] / 2];
+    /** What the view shows without zoom: the middle, the width and the height in pixels of the film. */
+    this.home = { x: facts.size_px[0] / 2, y: facts.size_px[1] / 2, width: facts.size_px[0], height: facts.size_px[1] };
+    /** The track of which `home` has the size. */
+    this.followed = -1;
+    /** How far the view was dragged, pixels of the film. */
+    this.offset = [0, 0];
     this.watch(select);
   }
 
@@ -149,11 +157,11 @@ export class FilmView {
       canvas.setPointerCapture(event.pointerId);
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (!drag || this.zoom === 1) return;
+      if (!drag) return;
       const { scale, ratio } = this.placement();
       drag.moved ||= Math.hypot(event.clientX - drag.x, event.clientY - drag.y) > 4;
       if (!drag.moved) return;
-      this.centre = [this.centre[0] - ((event.clientX - drag.x) * ratio) / scale, this.centre[1] - ((event.clientY - drag.y) * ratio) / scale];
+      this.offset = [this.offset[0] - ((event.clientX - drag.x) * ratio) / scale, this.offset[1] - ((event.clientY - drag.y) * ratio) / scale];
       drag = { x: event.clientX, y: event.clientY, moved: true };
       this.redraw();
     });
@@ -165,25 +173,26 @@ export class FilmView {
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       const [x, y] = this.inFilm(event), before = this.zoom;
-      this.zoom = Math.min(Math.max(before * Math.exp(-event.deltaY / 400), 1), 20);
+      this.zoom = Math.min(Math.max(before * Math.exp(-event.deltaY / 400), this.follows ? 0.2 : 1), 20);
       // the point under the pointer stays
       const share = 1 - before / this.zoom;
-      this.centre = [this.centre[0] + (x - this.centre[0]) * share, this.centre[1] + (y - this.centre[1]) * share];
+      this.offset = [this.offset[0] + (x - this.home.x - this.offset[0]) * share, this.offset[1] + (y - this.home.y - this.offset[1]) * share];
       this.redraw();
     }, { passive: false });
     canvas.addEventListener("dblclick", () => {
       this.zoom = 1;
+      this.offset = [0, 0];
       this.redraw();
     });
   }
 
   /** Scale and offset from film pixels to canvas pixels, and canvas pixels per pixel of the page. */
   placement() {
-    const [width, height] = this.facts.size_px, { canvas } = this;
-    const scale = Math.min(canvas.width / width, canvas.height / height) * this.zoom;
-    if (this.zoom === 1) this.centre = [width / 2, height / 2];
+    const { home, canvas } = this;
+    if (this.zoom === 1 && !this.follows) this.offset = [0, 0];
+    const scale = Math.min(canvas.width / home.width, canvas.height / home.height) * this.zoom;
     const ratio = canvas.width / Math.max(canvas.getBoundingClientRect().width, 1);
-    return { scale, ratio, x: canvas.width / 2 - this.centre[0] * scale, y: canvas.height / 2 - this.centre[1] * scale };
+    return { scale, ratio, x: canvas.width / 2 - (home.x + this.offset[0]) * scale, y: canvas.height / 2 - (home.y + this.offset[1]) * scale };
   }
 
   /** The point of the film under the pointer. @param {MouseEvent} event */
@@ -192,20 +201,17 @@ export class FilmView {
     return [((event.clientX - box.left) * ratio - x) / scale, ((event.clientY - box.top) * ratio - y) / scale];
   }
 
-  /** Moves the chosen bird to the middle. @param {Packed} poses @param {number} t @param {Set<number>} selected */
+  /** Shows the chosen bird in the middle. Its size stays until another bird is chosen. @param {Packed} poses @param {number} t @param {Set<number>} selected */
   follow(poses, t, selected) {
     const n = this.facts.tracks.findIndex((track) => selected.has(track.id));
-    const [, F, K] = poses.shapes.keypoints, { valid, keypoints } = poses.arrays, step = poses.facts.step_px;
-    if (n < 0 || !valid[n * F + t]) return;
-    let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
-    for (let k = (n * F + t) * K; k < (n * F + t + 1) * K; k++) {
-      left = Math.min(left, keypoints[2 * k] * step);
-      right = Math.max(right, keypoints[2 * k] * step);
-      top = Math.min(top, keypoints[2 * k + 1] * step);
-      bottom = Math.max(bottom, keypoints[2 * k + 1] * step);
-    }
-    if (this.zoom === 1) this.zoom = Math.min(Math.max((0.4 * this.facts.size_px[1]) / Math.max(right - left, bottom - top, 1), 1.01), 20);
-    this.centre = [(left + right) / 2, (top + bottom) / 2];
+    if (n < 0 || !poses.arrays.valid[n * poses.shapes.valid[1] + t]) return;
+    const box = boxOf(poses, n, t);
+    [this.home.x, this.home.y] = [box.x, box.y];
+    if (n === this.followed) return;
+    this.followed = n;
+    this.zoom = 1;
+    this.offset = [0, 0];
+    this.home.width = this.home.height = 1.35 * Math.max(box.width, box.height, 8);
   }
 
   /**
@@ -216,10 +222,9 @@ export class FilmView {
    * @param {Packed | null} outlines
    * @param {Set<number>} selected ids of tracks
    * @param {boolean} points whether keypoints are drawn
-   * @param {boolean} follow whether the chosen bird is in the middle
    */
-  draw(picture, t, poses, outlines, selected, points, follow) {
-    this.redraw = () => this.draw(picture, t, poses, outlines, selected, points, follow);
+  draw(picture, t, poses, outlines, selected, points) {
+    this.redraw = () => this.draw(picture, t, poses, outlines, selected, points);
     const box = this.canvas.getBoundingClientRect(), ratio = Math.min(window.devicePixelRatio, 2);
     const width = Math.max(1, Math.round(box.width * ratio)), height = Math.max(1, Math.round(box.height * ratio));
     if (this.canvas.width !== width || this.canvas.height !== height) {
@@ -227,7 +232,7 @@ export class FilmView {
       this.canvas.height = height;
     }
     const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d"));
-    if (follow && poses && t >= 0) this.follow(poses, t, selected);
+    if (this.follows && poses && t >= 0) this.follow(poses, t, selected);
     const { scale, x, y } = this.placement(), [w, h] = this.facts.size_px;
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, width, height);
@@ -236,8 +241,13 @@ export class FilmView {
     this.outlines = t < 0 ? null : outlines;
     this.t = t;
     if (t < 0) return;
-    if (outlines) this.drawOutlines(context, outlines, t, selected, scale);
-    if (poses && points) this.drawPoints(context, poses, t, selected, scale);
+    if (outlines) this.drawOutlines(context, outlines, t, selected, scale / ratio);
+    if (!poses) return;
+    this.facts.tracks.forEach((track, n) => {
+      if (!poses.arrays.valid[n * poses.shapes.valid[1] + t]) return;
+      if (points && this.follows && selected.has(track.id)) this.drawPoints(context, poses, n, t, scale / ratio);
+      else if (!this.follows && this.facts.tracks.length > 1) drawNumber(context, track, boxOf(poses, n, t), scale / ratio);
+    });
   }
 
   /** Paths of the birds at the present frame, [position of the track, path]. @param {Packed} outlines @param {number} t */
@@ -253,51 +263,39 @@ export class FilmView {
     }
   }
 
-  /** @param {CanvasRenderingContext2D} context @param {Packed} outlines @param {number} t @param {Set<number>} selected @param {number} scale */
+  /** @param {CanvasRenderingContext2D} context @param {Packed} outlines @param {number} t @param {Set<number>} selected @param {number} scale pixels of the page per pixel of the film */
   drawOutlines(context, outlines, t, selected, scale) {
     for (const [n, path] of this.paths(outlines, t)) {
       const { id, colour } = this.facts.tracks[n];
       context.strokeStyle = colour;
-      context.lineWidth = (selected.has(id) ? 3.5 : 2) / scale;
+      context.lineWidth = (selected.has(id) ? 3 : 2) / scale;
       context.stroke(path);
-      if (selected.has(id)) {
-        context.fillStyle = `${colour}30`;
-        context.fill(path);
-      }
     }
   }
 
-  /** @param {CanvasRenderingContext2D} context @param {Packed} poses @param {number} t @param {Set<number>} selected @param {number} scale */
-  drawPoints(context, poses, t, selected, scale) {
-    const { keypoints, detected, regions, valid } = poses.arrays, step = poses.facts.step_px;
-    const [N, F, K] = poses.shapes.keypoints;
-    for (let n = 0; n < N; n++) {
-      if (!valid[n * F + t]) continue;
-      const { id, colour } = this.facts.tracks[n], first = (n * F + t) * K;
-      const at = (/** @type {any} */ array, /** @type {number} */ k) => [array[2 * (first + k)] * step, array[2 * (first + k) + 1] * step];
-      if (regions && selected.has(id)) this.drawRegions(context, poses, first, colour, scale);
-      if (selected.has(id)) {
-        context.strokeStyle = "#ffffffa0";
-        context.lineWidth = 1 / scale;
-        for (const [a, b] of this.facts.skeleton) {
-          context.beginPath();
-          context.moveTo(...pair(at(keypoints, a)));
-          context.lineTo(...pair(at(keypoints, b)));
-          context.stroke();
-        }
+  /** Draws the keypoints of a bird: fitted ones as dots, detected ones as rings that lines join to the dots. @param {CanvasRenderingContext2D} context @param {Packed} poses @param {number} n @param {number} t @param {number} scale pixels of the page per pixel of the film */
+  drawPoints(context, poses, n, t, scale) {
+    const { keypoints, detected, regions } = poses.arrays, step = poses.facts.step_px;
+    const [, F, K] = poses.shapes.keypoints, first = (n * F + t) * K, { colour } = this.facts.tracks[n];
+    const at = (/** @type {any} */ array, /** @type {number} */ k) => pair(array, first + k, step);
+    if (regions) this.drawRegions(context, poses, first, colour, scale);
+    context.lineWidth = 1 / scale;
+    context.strokeStyle = "#ffffff90";
+    for (const [a, b] of this.facts.skeleton) line(context, at(keypoints, a), at(keypoints, b));
+    for (let k = 0; k < K; k++) {
+      if (detected && detected[2 * (first + k)] !== MISSING) {
+        context.strokeStyle = "#ffe14d";
+        context.lineWidth = 1.5 / scale;
+        line(context, at(detected, k), at(keypoints, k));
+        circle(context, at(detected, k), 5 / scale);
+        context.stroke();
       }
-      const radius = (selected.has(id) ? 2.6 : 1.5) / scale;
-      for (let k = 0; k < K; k++) {
-        if (detected && selected.has(id) && detected[2 * (first + k)] !== MISSING) {
-          context.strokeStyle = "#ffeb3c";
-          context.lineWidth = 1.3 / scale;
-          circle(context, at(detected, k), 2 * radius);
-          context.stroke();
-        }
-        context.fillStyle = "#fff";
-        circle(context, at(keypoints, k), radius);
-        context.fill();
-      }
+      circle(context, at(keypoints, k), 3 / scale);
+      context.fillStyle = "#fff";
+      context.strokeStyle = "#000a";
+      context.lineWidth = 1 / scale;
+      context.fill();
+      context.stroke();
     }
   }
 
@@ -329,8 +327,42 @@ export class FilmView {
   }
 }
 
-/** @param {number[]} point @returns {[number, number]} */
-const pair = (point) => [point[0], point[1]];
+/** The box of the fitted keypoints of a bird: its middle, its width and its height. @param {Packed} poses @param {number} n @param {number} t */
+function boxOf(poses, n, t) {
+  const [, F, K] = poses.shapes.keypoints, step = poses.facts.step_px;
+  const points = poses.arrays.keypoints.subarray(2 * (n * F + t) * K, 2 * (n * F + t + 1) * K);
+  let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
+  for (let k = 0; k < K; k++) {
+    left = Math.min(left, points[2 * k] * step);
+    right = Math.max(right, points[2 * k] * step);
+    top = Math.min(top, points[2 * k + 1] * step);
+    bottom = Math.max(bottom, points[2 * k + 1] * step);
+  }
+  return { x: (left + right) / 2, y: (top + bottom) / 2, width: right - left, height: bottom - top };
+}
+
+/** Writes the number of a track above its bird. @param {CanvasRenderingContext2D} context @param {import("viewer/data").Track} track @param {{x: number, y: number, height: number}} box @param {number} scale */
+function drawNumber(context, track, box, scale) {
+  context.font = `600 ${12 / scale}px system-ui, sans-serif`;
+  context.textAlign = "center";
+  context.lineWidth = 3 / scale;
+  context.strokeStyle = "#000b";
+  context.fillStyle = track.colour;
+  const text = String(track.id), y = box.y - box.height / 2 - 9 / scale;
+  context.strokeText(text, box.x, y);
+  context.fillText(text, box.x, y);
+}
+
+/** A point of packed positions, in pixels of the film. @param {Int16Array} array @param {number} k @param {number} step @returns {[number, number]} */
+const pair = (array, k, step) => [array[2 * k] * step, array[2 * k + 1] * step];
+
+/** @param {CanvasRenderingContext2D} context @param {[number, number]} from @param {[number, number]} to */
+function line(context, from, to) {
+  context.beginPath();
+  context.moveTo(...from);
+  context.lineTo(...to);
+  context.stroke();
+}
 
 /** @param {CanvasRenderingContext2D} context @param {number[]} at @param {number} radius */
 function circle(context, at, radius) {

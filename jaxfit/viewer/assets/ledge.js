@@ -21,16 +21,18 @@ export class LedgeView {
     parent.append(this.message);
     /** @type {THREE.SkinnedMesh[]} */
     this.birds = [];
-    this.mode = "orbit";
+    this.mode = "follow";
     this.ready = false;
     this.scene = new THREE.Scene();
+    this.rock = new THREE.MeshLambertMaterial({ side: THREE.DoubleSide });
     this.orbit = new THREE.PerspectiveCamera(40, 1, 0.01, 1000);
     this.film = new THREE.PerspectiveCamera(40, 1, 0.01, 1000);
     /** @type {THREE.WebGLRenderer | null} */
     this.renderer = null;
-    /** @type {THREE.Vector3 | null} */
-    this.followed = null;
+    /** The bird that the view follows. */
+    this.followed = -1;
     this.shapeOf = new Map();
+    this.showAll = () => {};
   }
 
   /** Builds the scene. @param {Packed} rig */
@@ -44,7 +46,6 @@ export class LedgeView {
     }
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.parent.prepend(this.renderer.domElement);
-    this.scene.background = new THREE.Color(0xdfe8ee);
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0x8d8577, 2.4));
     const sun = new THREE.DirectionalLight(0xffffff, 1.5);
     sun.position.set(1, -2, 4);
@@ -69,17 +70,20 @@ export class LedgeView {
     // the axis up has to be set before the controls are made
     this.orbit.up.set(0, level ? 0 : -1, level ? 1 : 0);
     const eye = new THREE.Vector3(x, y, z), size = Math.max(new THREE.Vector3(...high).distanceTo(new THREE.Vector3(...low)), 3 * length);
-    const towards = eye.clone().sub(middle);
-    if (level) towards.z = Math.max(towards.z, 0.35 * Math.hypot(towards.x, towards.y));
-    this.orbit.position.copy(middle).addScaledVector(towards.normalize(), 1.5 * size + 2 * length);
     this.orbit.near = 0.02 * length;
     this.orbit.far = 200 * size;
     this.film.near = this.orbit.near;
     this.film.far = this.orbit.far + eye.distanceTo(middle);
-    this.controls = new OrbitControls(this.orbit, this.renderer?.domElement);
-    this.controls.target.copy(middle);
-    this.controls.update();
-    this.controls.addEventListener("change", () => this.render());
+    const controls = (this.controls = new OrbitControls(this.orbit, this.renderer?.domElement));
+    this.showAll = () => {
+      const towards = eye.clone().sub(middle);
+      if (level) towards.z = Math.max(towards.z, 0.35 * Math.hypot(towards.x, towards.y));
+      this.orbit.position.copy(middle).addScaledVector(towards.normalize(), 1.2 * size + length);
+      controls.target.copy(middle);
+      controls.update();
+    };
+    this.showAll();
+    controls.addEventListener("change", () => this.render());
   }
 
   addLedge() {
@@ -89,7 +93,7 @@ export class LedgeView {
     const grid = new THREE.GridHelper(side, Math.min(Math.max(Math.round(side / length), 2), 10 * cells), 0x6b6357, 0xa39b8c);
     grid.rotation.x = Math.PI / 2;
     grid.position.set((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0);
-    const plane = new THREE.Mesh(new THREE.PlaneGeometry(side, side), new THREE.MeshLambertMaterial({ color: 0xc9c1b2, side: THREE.DoubleSide }));
+    const plane = new THREE.Mesh(new THREE.PlaneGeometry(side, side), this.rock);
     plane.position.set(grid.position.x, grid.position.y, -0.01 * length);
     this.scene.add(grid, plane);
   }
@@ -170,23 +174,28 @@ export class LedgeView {
   /** @param {Set<number>} selected */
   followBird(selected) {
     const n = this.facts.tracks.findIndex((track) => selected.has(track.id));
-    const mesh = this.birds[n], place = mesh?.skeleton.bones[0].position;
-    if (this.mode !== "follow" || !mesh?.visible) {
-      this.followed = null;
-      return;
+    const mesh = this.birds[n], controls = this.controls;
+    if (this.mode !== "follow" || !mesh?.visible || !controls) return;
+    mesh.updateMatrixWorld();
+    const joints = mesh.skeleton.bones.map((bone) => bone.getWorldPosition(new THREE.Vector3()));
+    const { center, radius } = new THREE.Box3().setFromPoints(joints).getBoundingSphere(new THREE.Sphere());
+    const seen = this.orbit.position.clone().sub(controls.target);
+    if (this.followed !== n) {
+      // the bird fills the shorter side of the panel
+      const { clientWidth: width, clientHeight: height } = this.parent;
+      seen.setLength((1.1 * radius) / Math.sin((this.orbit.fov * Math.PI) / 360) / Math.min(1, width / Math.max(height, 1)));
     }
-    const controls = /** @type {OrbitControls} */ (this.controls);
-    const from = this.followed ?? controls.target, seen = this.orbit.position.clone().sub(from);
-    if (!this.followed) seen.setLength(3.5 * this.rig?.facts.length);
-    this.orbit.position.copy(place).add(seen);
-    controls.target.copy(place);
-    this.followed = place.clone();
+    this.orbit.position.copy(center).add(seen);
+    controls.target.copy(center);
+    this.followed = n;
     controls.update();
   }
 
   /** @param {string} mode `orbit`, `follow` or `film` */
   look(mode) {
+    if (mode === "orbit" && this.mode !== mode) this.showAll();
     this.mode = mode;
+    this.followed = -1;
     if (this.controls) this.controls.enabled = mode !== "film";
   }
 
@@ -203,6 +212,9 @@ export class LedgeView {
       const half = Math.tan((this.rig?.facts.camera.field_deg * Math.PI) / 360) * (own < film ? film / own : 1);
       camera.fov = (2 * Math.atan(half) * 180) / Math.PI;
     }
+    const style = getComputedStyle(this.parent);
+    this.scene.background = new THREE.Color(style.backgroundColor);
+    this.rock.color.set(style.getPropertyValue("--rock"));
     camera.aspect = width / height;
     camera.updateProjectionMatrix();
     this.renderer.render(this.scene, camera);

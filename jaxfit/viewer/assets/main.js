@@ -11,7 +11,23 @@ import { Timeline } from "viewer/timeline";
 
 const find = (/** @type {string} */ id) => /** @type {any} */ (document.getElementById(id));
 
-/** One result with its two views. */
+/** A bar whose dragging gives the panel after it another share of the two. */
+function splitter() {
+  const bar = document.createElement("div");
+  bar.className = "splitter";
+  bar.addEventListener("pointerdown", (event) => bar.setPointerCapture(event.pointerId));
+  bar.addEventListener("pointermove", (event) => {
+    const parent = bar.parentElement, panel = /** @type {HTMLElement | null} */ (bar.nextElementSibling);
+    if (!bar.hasPointerCapture(event.pointerId) || !parent || !panel) return;
+    const box = parent.getBoundingClientRect(), beside = getComputedStyle(parent).flexDirection === "row";
+    const share = beside ? (box.right - event.clientX) / box.width : (box.bottom - event.clientY) / box.height;
+    panel.style.flex = `0 0 ${100 * Math.min(Math.max(share, 0.08), 0.85)}%`;
+    window.dispatchEvent(new Event("resize"));
+  });
+  return bar;
+}
+
+/** One result: the chosen bird, the whole film, and the birds in 3D. */
 class Column {
   /** @param {number} number @param {import("viewer/data").ResultFacts} facts @param {boolean} film */
   constructor(number, facts, film) {
@@ -20,12 +36,20 @@ class Column {
     this.positions = new Map(facts.frames.map((frame, t) => [frame, t]));
     this.section = document.createElement("section");
     this.section.className = "result";
-    const title = document.createElement("h2");
+    const title = document.createElement("h2"), others = document.createElement("div");
     title.textContent = facts.name;
+    others.className = "others";
     this.section.append(title);
-    /** @type {FilmView | null} */
-    this.film = film ? new FilmView(this.panel("film"), facts, select) : null;
-    this.ledge = new LedgeView(this.panel("ledge"), facts, select);
+    /** The views of the film: the chosen bird, and the whole picture. @type {FilmView[]} */
+    this.films = [];
+    if (film) {
+      this.films = [new FilmView(panel(this.section, "close"), facts, select, true), new FilmView(panel(others, "film"), facts, select)];
+      this.section.append(splitter());
+      others.append(splitter());
+    }
+    this.ledge = new LedgeView(panel(others, "ledge"), facts, select);
+    this.section.append(others);
+    if (number) find("results").append(splitter());
     find("results").append(this.section);
     this.ledge.message.textContent = "Placing the birds …";
     arrays(number, "rig").then((rig) => {
@@ -35,12 +59,9 @@ class Column {
     }, (error) => { this.ledge.message.textContent = error.message; });
   }
 
-  /** @param {string} name */
-  panel(name) {
-    const panel = document.createElement("div");
-    panel.className = name;
-    this.section.append(panel);
-    return panel;
+  /** The view of the whole picture; null without a film. */
+  get film() {
+    return this.films[1] ?? null;
   }
 
   /** Loads a frame and the next frames; returns what is there already. @param {number} frame */
@@ -58,6 +79,14 @@ class Column {
     if (outlines && !drawn) outlines.then(() => { if (frame === state.frames[state.i]) refresh(); });
     return { t: t % size, poses, outlines: drawn };
   }
+}
+
+/** @param {HTMLElement} parent @param {string} name */
+function panel(parent, name) {
+  const made = document.createElement("div");
+  made.className = name;
+  parent.append(made);
+  return made;
 }
 
 const state = {
@@ -113,8 +142,10 @@ async function draw(seek) {
     if (toFrame) picture = state.film?.picture ?? null;
     state.columns.forEach((column, c) => {
       const { t, poses, outlines } = found[c];
-      column.film?.draw(picture, t, poses, outlines, state.selected, find("points").checked, find("camera").value === "follow");
-      if (column.film) column.film.message.textContent = state.film?.problem ?? "";
+      column.films.forEach((film) => {
+        film.draw(picture, t, poses, outlines, state.selected, find("points").checked);
+        film.message.textContent = state.film?.problem ?? "";
+      });
       if (poses) column.ledge.pose(poses, t, state.selected);
       else column.ledge.pose(/** @type {any} */ ({ shapes: { valid: [0, 0] } }), -1, state.selected);
       column.ledge.render();
@@ -129,7 +160,7 @@ function showNumbers() {
   const frame = state.frames[state.i], time = state.times[state.i];
   if (document.activeElement !== find("frame")) find("frame").value = frame;
   find("time").textContent = time === null ? "" : `${time.toFixed(3)} s`;
-  find("play").textContent = state.playing ? "Pause" : "Play";
+  find("play").querySelector("path").setAttribute("d", state.playing ? "M4 2v12M11 2v12" : "M4 2l10 6-10 6z");
   const marks = (state.corrections?.marks ?? []).map((each) => state.frames.indexOf(each));
   state.timeline?.drawCursor(state.i, marks);
   if (!state.playing) {
@@ -215,11 +246,10 @@ async function showValue() {
   timeline.title = "computing …";
   timeline.values = null;
   timeline.drawStill(state.selected);
-  const chosen = state.columns[0].facts.values.find((each) => each.name === name);
   try {
     const { arrays: found } = await arrays(0, `values/${name}`);
     timeline.values = spread(found.values, state.columns[0], NaN, Float32Array);
-    timeline.title = chosen?.unit ? `${chosen.title} (${chosen.unit})` : chosen?.title ?? "";
+    timeline.title = "";
   } catch (error) {
     find("notes").textContent = String(/** @type {Error} */ (error).message);
   }
@@ -242,49 +272,91 @@ function spread(values, column, empty, Type) {
   return /** @type {A} */ (found);
 }
 
-function watchControls() {
-  const keys = /** @type {Record<string, () => void>} */ ({
-    " ": () => (state.playing ? pause() : play()),
-    ArrowRight: () => go(state.i + 1),
-    ArrowLeft: () => go(state.i - 1),
-    Home: () => go(0),
-    End: () => go(state.frames.length - 1),
-    n: () => goToFlag(1),
-    p: () => goToFlag(-1),
-    m: () => state.corrections?.mark(),
-    "[": () => setRange(0),
-    "]": () => setRange(1),
-    Escape: () => { state.range = [null, null]; state.selected.clear(); rangeChanged(); },
-  });
+/** Keys: names of `KeyboardEvent.key` with their effect, for people, and what they do. @type {[string[], string, () => void][]} */
+const KEYS = [
+  [[" "], "Play or pause", () => (state.playing ? pause() : play())],
+  [["ArrowLeft"], "One frame back; with shift, ten frames", () => go(state.i - 1)],
+  [["ArrowRight"], "One frame on; with shift, ten frames", () => go(state.i + 1)],
+  [["Home"], "First frame", () => go(0)],
+  [["End"], "Last frame", () => go(state.frames.length - 1)],
+  [["n"], "Next moment at which a pose becomes unsure or contradicted", () => goToFlag(1)],
+  [["p"], "Previous such moment", () => goToFlag(-1)],
+  [["ArrowUp"], "Choose the bird above in the timeline", () => chooseRow(-1)],
+  [["ArrowDown"], "Choose the bird below in the timeline", () => chooseRow(1)],
+  [["k"], "Show or hide the keypoints", () => find("points").click()],
+  [["["], "First frame of a range", () => setRange(0)],
+  [["]"], "Last frame of the range", () => setRange(1)],
+  [["Escape"], "No bird and no range is chosen", () => { state.range = [null, null]; state.selected.clear(); rangeChanged(); }],
+  [["?"], "These keys", () => find("keys").showModal()],
+];
+/** Keys that need a session of corrections. @type {typeof KEYS} */
+const CORRECTING = [
+  [["s"], "Swap two chosen birds", () => state.corrections?.add("swap")],
+  [["c"], "Cut the chosen bird at this frame", () => state.corrections?.add("cut")],
+  [["j"], "Join two chosen birds", () => state.corrections?.add("join")],
+  [["Delete"], "Delete the chosen birds", () => state.corrections?.add("delete")],
+  [["e"], "Exclude the chosen bird in the range", () => state.corrections?.add("exclude")],
+  [["Control+z", "u"], "Undo the last correction", () => state.corrections?.undo()],
+  [["r"], "Refit", () => find("refit").click()],
+  [["m"], "Mark the frame for labelling", () => state.corrections?.mark()],
+];
+
+/** @param {boolean} correcting whether the page takes corrections */
+function watchControls(correcting) {
+  const all = correcting ? [...KEYS, ...CORRECTING] : KEYS;
+  const keys = new Map(all.flatMap(([names, , act]) => names.map((name) => /** @type {[string, () => void]} */ ([name, act]))));
+  find("keys").querySelector("table").replaceChildren(...all.map(([names, effect]) => {
+    const row = document.createElement("tr");
+    row.insertCell().append(...names.map((name) => Object.assign(document.createElement("kbd"), { textContent: name === " " ? "space" : name.replace("Control", "Ctrl").replace("Arrow", "") })));
+    row.insertCell().textContent = effect;
+    return row;
+  }));
   document.addEventListener("keydown", (event) => {
     const target = /** @type {HTMLElement} */ (event.target);
-    if (event.ctrlKey || event.metaKey || event.altKey || /INPUT|SELECT/.test(target.tagName)) return;
-    if (event.shiftKey && event.key.startsWith("Arrow")) go(state.i + (event.key === "ArrowRight" ? 10 : -10));
-    else if (event.key in keys) keys[event.key]();
-    else return;
+    if (event.altKey || /INPUT|SELECT/.test(target.tagName) || find("keys").open) return;
+    if (event.shiftKey && /^Arrow(Left|Right)$/.test(event.key)) go(state.i + (event.key === "ArrowRight" ? 10 : -10));
+    else {
+      const act = keys.get(event.ctrlKey || event.metaKey ? `Control+${event.key}` : event.key);
+      if (!act) return;
+      act();
+    }
     event.preventDefault();
   });
-  find("play").onclick = keys[" "];
-  find("back").onclick = keys.ArrowLeft;
-  find("on").onclick = keys.ArrowRight;
-  find("next").onclick = keys.n;
-  find("previous").onclick = keys.p;
+  for (const [button, key] of Object.entries({ play: " ", back: "ArrowLeft", on: "ArrowRight", next: "n", previous: "p", help: "?" })) {
+    find(button).onclick = keys.get(key);
+    find(button).title = `${all.find(([names]) => names.includes(key))?.[1]} (${key === " " ? "space" : key})`;
+  }
   find("frame").onchange = () => go(nearest(Number(find("frame").value)));
   find("points").onchange = () => refresh();
   find("value").onchange = showValue;
   find("camera").onchange = () => {
-    state.columns.forEach((column) => {
-      column.ledge.look(find("camera").value);
-      if (column.film) column.film.zoom = 1;
-    });
+    state.columns.forEach((column) => column.ledge.look(find("camera").value));
     refresh();
   };
-  for (const button of document.querySelectorAll("button, select")) {
-    button.addEventListener("click", () => /** @type {HTMLElement} */ (button).tagName === "BUTTON" && /** @type {HTMLElement} */ (button).blur());
-    button.addEventListener("change", () => /** @type {HTMLElement} */ (button).blur());
+  for (const control of document.querySelectorAll("button, select, input[type=checkbox]")) {
+    control.addEventListener(control.tagName === "BUTTON" ? "click" : "change", () => /** @type {HTMLElement} */ (control).blur());
   }
-  window.addEventListener("resize", () => { state.timeline?.drawStill(state.selected); refresh(); });
+  const redraw = () => { state.timeline?.drawStill(state.selected); refresh(); };
+  window.addEventListener("resize", redraw);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   window.addEventListener("hashchange", () => { if (readAddress()) refresh(); });
+}
+
+/** Chooses a neighbour of the chosen bird in the timeline. @param {number} by */
+function chooseRow(by) {
+  const rows = state.timeline?.rows ?? [], chosen = rows.findIndex((row) => state.selected.has(row.id));
+  select(rows[Math.min(Math.max(chosen + by, 0), rows.length - 1)].id, false);
+}
+
+/** Gives buttons the icons that their `data-icon` describes, as lines in a square of 16. */
+function drawIcons() {
+  for (const button of document.querySelectorAll("[data-icon]")) {
+    const icon = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+    icon.setAttribute("viewBox", "0 0 16 16");
+    icon.append(document.createElementNS("http://www.w3.org/2000/svg", "path"));
+    icon.firstElementChild?.setAttribute("d", button.getAttribute("data-icon") ?? "");
+    button.prepend(icon);
+  }
 }
 
 /** @param {0 | 1} end */
@@ -331,6 +403,20 @@ async function addColumns(facts) {
   find("results").classList.toggle("several", state.columns.length > 1);
 }
 
+/** @param {import("viewer/data").ResultFacts} facts */
+function drawLegend(facts) {
+  const meanings = ["the pose agrees with the detections", "the detections do not determine the pose", "the detections contradict the pose"];
+  const entries = facts.flags.map((flag, i) => /** @type {[string, string, string]} */ (["swatch", facts.flag_colours[i], `${flag}: ${meanings[i]}`]));
+  entries.push(["dot", "", "fitted keypoint"], ...(facts.detected ? [/** @type {[string, string, string]} */ (["dot ring", "", "detected keypoint, joined to the fitted one"])] : []));
+  find("legend").append(...entries.map(([name, colour, text]) => {
+    const entry = document.createElement("span"), key = document.createElement("i");
+    key.className = name;
+    key.style.background = colour;
+    entry.append(key, text);
+    return entry;
+  }), "Click a bird to choose it, shift adds a second one. The wheel zooms, a double click resets the view.");
+}
+
 async function open() {
   const facts = await readFacts();
   const frames = [...new Set(facts.results.flatMap((result) => result.frames))].sort((a, b) => a - b);
@@ -353,13 +439,15 @@ async function open() {
       refitted: async () => { await addColumns(await readFacts()); refresh(); },
     });
   }
-  find("value").replaceChildren(...first.values.map((each) => new Option(each.title, each.name)));
-  find("legend").textContent = "Rows: low green is ok, orange unsure, high red contradicted by the detections. "
-    + "The wheel zooms. Keys: space plays, arrows step, n and p go to flagged moments" + (facts.corrections ? ", [ and ] set a range, m marks a frame." : ".");
+  find("value").replaceChildren(...first.values.map((each) => new Option(each.unit ? `${each.title} (${each.unit})` : each.title, each.name)));
+  drawIcons();
+  drawLegend(first);
   find("notes").textContent = (facts.notes ?? []).concat(film ? [] : ["The film is not given: --video shows it."]).join(" ");
+  document.querySelector("main")?.after(splitter());
   await addColumns(facts);
   readAddress();
-  watchControls();
+  if (!location.hash.includes("birds=")) state.selected = new Set([first.tracks[0].id]);
+  watchControls(facts.corrections !== null);
   await state.film?.open();
   state.timeline.drawStill(state.selected);
   await refresh();

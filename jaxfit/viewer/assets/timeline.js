@@ -29,6 +29,7 @@ export class Timeline {
     /** @type {Float32Array | null} */
     this.values = null;
     this.title = "";
+    this.ink = this.soft = this.chosen = this.band = "#888";
     this.height = CURVE + ROW * rows.length;
     this.range = /** @type {[number | null, number | null]} */ ([null, null]);
     this.watch(actions);
@@ -75,16 +76,17 @@ export class Timeline {
 
   /** Draws all but the present frame. @param {Set<number>} selected */
   drawStill(selected) {
-    const { context, width } = this.context(this.still);
+    const { context, width } = this.context(this.still), style = getComputedStyle(this.parent);
+    [this.ink, this.soft, this.chosen, this.band] = ["--ink", "--soft", "--chosen", "--band"].map((name) => style.getPropertyValue(name));
     context.font = "11px system-ui, sans-serif";
     context.textBaseline = "middle";
     this.rows.forEach(({ id, colour }, n) => {
       const top = CURVE + n * ROW;
-      context.fillStyle = selected.has(id) ? "#fff3c4" : n % 2 ? "#f1f1ef" : "#f8f8f7";
-      context.fillRect(0, top, width, ROW);
+      context.fillStyle = selected.has(id) ? this.chosen : this.band;
+      context.fillRect(0, top, width, ROW - 1);
       context.fillStyle = colour;
       context.fillRect(2, top + 3, 8, ROW - 6);
-      context.fillStyle = "#222";
+      context.fillStyle = this.ink;
       context.fillText(String(id), 14, top + ROW / 2 + 0.5, LABEL - 16);
       this.drawFlags(context, n, top, width);
     });
@@ -112,8 +114,6 @@ export class Timeline {
 
   /** @param {CanvasRenderingContext2D} context @param {number} width @param {Set<number>} selected */
   drawCurve(context, width, selected) {
-    context.fillStyle = "#fff";
-    context.fillRect(0, 0, width, CURVE);
     const values = this.values, T = this.frames.length;
     if (!values) return;
     let low = Infinity, high = -Infinity;
@@ -137,7 +137,7 @@ export class Timeline {
       }
       context.stroke();
     }
-    context.fillStyle = "#444";
+    context.fillStyle = this.soft;
     context.fillText(this.title, LABEL + 4, 8);
     context.textAlign = "right";
     context.fillText(short(high), LABEL - 4, y(high));
@@ -150,7 +150,7 @@ export class Timeline {
     const { context, width } = this.context(this.cursor);
     context.fillStyle = "#7b1fa2";
     for (const mark of marks) context.fillRect(this.x(mark, width) - 1.5, 0, 3, 7);
-    context.fillStyle = "#111";
+    context.fillStyle = this.ink;
     context.fillRect(this.x(i, width) - 0.75, 0, 1.5, this.height);
   }
 }
