@@ -253,6 +253,13 @@ def test_poses_of_low_trust_are_not_recommended_for_statistics(folder, made):
     assert "jaxfit suggest" not in commands("high")
     assert "jaxfit export" not in commands("low")
     assert "jaxfit suggest" in commands("low")
+    assert "--labels LABELS" in commands("low")
+
+
+def test_a_result_of_labels_asks_for_further_labels(folder, made):
+    summary = {"trust": "high", "pose_sources": {"3": {"labels": 3, "flow": 9, "outline": 0}}}
+    texts = [step.text for step in next_steps(gather(made, None, summary, "", folder))]
+    assert any("further frames" in text for text in texts)
 
 
 def test_metrics_against_a_known_truth_are_tables(report):

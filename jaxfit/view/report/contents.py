@@ -378,9 +378,17 @@ def next_steps(report: Report) -> list[Step]:
         "and each bird must keep its track number. This command draws the video again:"
     )
     steps = [Step(text, draw)]
-    if report.trust == "low":
-        command = f"jaxfit suggest {video} --result {result} --count 10 --out label"
-        steps.append(Step("Label ten frames of this footage, and train the networks with them.", command))
+    on_labels = any(name.startswith("poses of track ") for name in report.facts)
+    if report.trust == "low" or on_labels:
+        text = (
+            "Mark the keypoints in further frames in which the overlay is wrong, and add them to your labels:"
+            if on_labels
+            else "The built-in networks may not know this bird. Mark its keypoints in three to ten frames; nothing is "
+            "trained. The guide “Other birds” says how."
+        )
+        frames = f"jaxfit suggest {video} --result {result} --count 6 --out to_label"
+        again = f"jaxfit reconstruct {video} --segmenter general --labels LABELS --model aves --out by_labels"
+        steps.append(Step(text, f"{frames}\n{again}"))
     if report.has_detections and len(report.tracks) > 1:
         a, b = (track.track_id for track in report.tracks[:2])
         middle = report.frames[len(report.frames) // 2]
