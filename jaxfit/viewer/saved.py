@@ -126,7 +126,7 @@ def _save_folder(
 def _curves(result: Shown) -> tuple[dict[str, bytes], list[str]]:
     """Return the curves that a page holds, and what it leaves out, for people."""
     names = [each["name"] for each in result.kinds_of_values]
-    curves, left_out = {}, ["corrections, which need `jaxfit view`"]
+    curves, left_out = {}, ["corrections and the reasons of flags, which need `jaxfit view`"]
     for name in CURVES:
         if name in names:
             try:

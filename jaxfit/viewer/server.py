@@ -241,11 +241,12 @@ _HEADERS = [
 
 
 def _content(result: Shown, kind: str, argument: str | None) -> bytes:
-    """Return arrays of a result: `rig`, `flags`, `poses/3`, `outlines/3`, `values/speed`."""
+    """Return arrays of a result: `rig`, `flags`, `poses/3`, `outlines/3`, `why/120`, `values/speed`."""
     if kind in ("rig", "flags") and argument is None:
         return result.rig() if kind == "rig" else result.flags()
-    if kind in ("poses", "outlines") and argument is not None:
-        return result.part(_number(argument)) if kind == "poses" else result.outlines(_number(argument))
+    numbered = {"poses": result.part, "outlines": result.outlines, "why": result.why}
+    if kind in numbered and argument is not None:
+        return numbered[kind](_number(argument))
     if kind == "values" and argument in [each["name"] for each in result.kinds_of_values]:
         return result.values(argument)
     raise HTTPException(404)

@@ -29,6 +29,7 @@ from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.view.birds import REGION_95, Detected, DrawnBird, outlines
 from jaxfit.view.colours import FLAG_COLOURS, css, track_colour
 from jaxfit.viewer.arrays import in_steps, pack
+from jaxfit.viewer.why import Why
 
 FRAMES = 50
 """Frames that the page loads at once."""
@@ -91,6 +92,21 @@ class Shown:
     @cached_property
     def _posed(self) -> PosedBirds:
         return PosedBirds(self.solution, self.bird, self._lens)
+
+    @cached_property
+    def _why(self) -> Why:
+        return Why(self.solution, self.bird, self.observations, self._lens)
+
+    def why(self, pose: int) -> bytes:
+        """Return what speaks for and against a pose, by its position n·T + t among all poses (`Why.entries`).
+
+        Raises:
+            InputError: there is no such pose.
+        """
+        if not 0 <= pose < self.solution.valid.size:
+            raise InputError(f"pose {pose}", "is not in the result", "reload the page")
+        with self._lock:
+            return pack({}, self._why.entries(*divmod(pose, self.solution.valid.shape[1])))
 
     @cached_property
     def flock(self) -> Flock:

@@ -1,5 +1,7 @@
 """What the page receives is the result: poses, outlines, regions, values; a copy of the film has the same frames."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ from support.birds import error_bars
 from support.viewed import shown, unpacked, write_result
 
 from jaxfit.data.flags import flags
+from jaxfit.data.formats.coco import read_coco, write_coco
+from jaxfit.data.masks import encode_mask
 from jaxfit.data.projection import PosedBirds
 from jaxfit.foundation.errors import InputError
 from jaxfit.video.reader import read_frames
@@ -123,6 +127,57 @@ def test_values_over_time(result, tmp_path):
         without.values("residual")
     with pytest.raises(InputError, match="is not known"):
         without.values("wing_spread")  # the toy bird has no wings
+
+
+def test_why_names_the_wrong_keypoint_and_what_is_usual(tmp_path):
+    """One detection is 12 px off, in a result whose other detections are the projected keypoints."""
+    k, n, t, off = 3, 1, 4, np.array([12.0, 0])
+    folder, _ = write_result(
+        tmp_path, doubts=np.where(np.arange(overlays.T) == t, 1, 0)[None].repeat(2, 0).astype(np.int8)
+    )
+    seen = read_coco(folder / "observations.json")
+    points = seen.keypoints_px.copy()
+    points[n, t, k] += off
+    write_coco(seen.with_keypoints(points, seen.confidence), folder / "observations.json")
+    found = shown(folder)
+    why = unpacked(found.why(n * overlays.T + t))[0]
+    assert (why["flag"], why["doubts"]) == ("contradicted", ["keypoints far from the pose"])
+    name, px, usual = (why["keypoints"][0][key] for key in ("name", "px", "usual_px"))
+    assert name == overlays.BIRD.keypoint_names[k].replace("_", " ")
+    assert px == pytest.approx(12, abs=0.1)
+    assert usual < 0.1
+    measures = {row["title"]: row for row in why["measures"]}
+    weights = seen.confidence[n, t]
+    share = 12 * weights[k] / weights.sum() / seen.box_px[n, t, 2:].max()
+    assert measures["Keypoints off, of the box"] == {
+        "title": "Keypoints off, of the box", "here": f"{share:.1%}", "usual": "0.0%", "bad": True,
+    }  # fmt: skip
+    assert unpacked(found.why(overlays.T + 2))[0]["flag"] == "no pose"
+    with pytest.raises(InputError, match="pose 12"):
+        found.why(12)
+    (folder / "observations.json").unlink()
+    without = unpacked(shown(folder).why(0))[0]
+    assert (without["flag"], without["keypoints"]) == ("ok", [])
+
+
+def test_outline_agreement_is_the_iou_of_mesh_and_mask(tmp_path):
+    """Masks are the meshes; the mask of one pose lacks its lower half."""
+    folder, _ = write_result(tmp_path)
+    seen, solution = read_coco(folder / "observations.json"), overlays.solution()
+    posed, faces, masks = PosedBirds(solution, overlays.BIRD), np.asarray(overlays.BIRD.faces), {}
+    for n, t in np.argwhere(solution.valid).tolist():
+        mask = np.zeros((overlays.HEIGHT, overlays.WIDTH), np.uint8)
+        for face in posed.vertices_screen(n, t)[:, :2][faces]:
+            cv2.fillConvexPoly(mask, np.round(face - 0.5).astype(int), 1)
+        masks[n, t] = mask > 0
+    whole, (rows, _) = masks[0, 1].sum(), np.nonzero(masks[0, 1])
+    masks[0, 1][int(np.median(rows)) :] = False
+    seen = dataclasses.replace(seen, masks={cell: encode_mask(mask) for cell, mask in masks.items()})
+    write_coco(seen, folder / "observations.json")
+    measures = {row["title"]: row for row in unpacked(shown(folder).why(1))[0]["measures"]}
+    here, usual = (float(measures["Outline agreement (IoU)"][key].rstrip("%")) for key in ("here", "usual"))
+    assert here == pytest.approx(100 * masks[0, 1].sum() / whole, abs=6)
+    assert usual > 85
 
 
 def test_regions_are_the_axes_of_the_covariance(tmp_path):

@@ -137,6 +137,8 @@ export class FilmView {
     this.outlines = null;
     this.redraw = () => {};
     this.t = -1;
+    /** The keypoint of the chosen bird that is drawn in red. @type {{k: number, text: string} | null} */
+    this.marked = null;
     this.zoom = 1;
     /** What the view shows without zoom: the middle, the width and the height in pixels of the film. */
     this.home = { x: facts.size_px[0] / 2, y: facts.size_px[1] / 2, width: facts.size_px[0], height: facts.size_px[1] };
@@ -297,6 +299,15 @@ export class FilmView {
       context.fill();
       context.stroke();
     }
+    if (this.marked && detected) {
+      const { k, text } = this.marked, [x, y] = at(detected, k);
+      context.strokeStyle = "#ff4040";
+      context.lineWidth = 3 / scale;
+      line(context, [x, y], at(keypoints, k));
+      circle(context, [x, y], 7 / scale);
+      context.stroke();
+      write(context, text, x + 12 / scale, y, scale, "#ff7b7b", "left");
+    }
   }
 
   /** @param {CanvasRenderingContext2D} context @param {Packed} poses @param {number} first @param {string} colour @param {number} scale */
@@ -343,14 +354,19 @@ function boxOf(poses, n, t) {
 
 /** Writes the number of a track above its bird. @param {CanvasRenderingContext2D} context @param {import("viewer/data").Track} track @param {{x: number, y: number, height: number}} box @param {number} scale */
 function drawNumber(context, track, box, scale) {
-  context.font = `600 ${12 / scale}px system-ui, sans-serif`;
-  context.textAlign = "center";
+  write(context, String(track.id), box.x, box.y - box.height / 2 - 9 / scale, scale, track.colour, "center");
+}
+
+/** @param {CanvasRenderingContext2D} context @param {string} text @param {number} x @param {number} y @param {number} scale @param {string} colour @param {CanvasTextAlign} align */
+function write(context, text, x, y, scale, colour, align) {
+  context.font = `600 ${13 / scale}px system-ui, sans-serif`;
+  context.textAlign = align;
+  context.textBaseline = "middle";
   context.lineWidth = 3 / scale;
-  context.strokeStyle = "#000b";
-  context.fillStyle = track.colour;
-  const text = String(track.id), y = box.y - box.height / 2 - 9 / scale;
-  context.strokeText(text, box.x, y);
-  context.fillText(text, box.x, y);
+  context.strokeStyle = "#000c";
+  context.fillStyle = colour;
+  context.strokeText(text, x, y);
+  context.fillText(text, x, y);
 }
 
 /** A point of packed positions, in pixels of the film. @param {Int16Array} array @param {number} k @param {number} step @returns {[number, number]} */

@@ -9,6 +9,10 @@ import { Timeline } from "viewer/timeline";
 /** @typedef {import("viewer/data").Facts} Facts */
 /** @typedef {import("viewer/data").Packed} Packed */
 
+/** How long a moment is shown before its reasons are asked for, milliseconds. */
+const WHY_MS = 120;
+/** Keypoints that the page lists, from the worst on. */
+const WORST = 7;
 const find = (/** @type {string} */ id) => /** @type {any} */ (document.getElementById(id));
 
 /** A bar whose dragging gives the panel after it another share of the two. */
@@ -154,6 +158,7 @@ async function draw(seek) {
     find("notes").textContent = String(/** @type {Error} */ (error).message);
   }
   showNumbers();
+  showWhy();
 }
 
 function showNumbers() {
@@ -169,6 +174,58 @@ function showNumbers() {
     if (state.selected.size) parts.push(`birds=${[...state.selected].join(",")}`);
     history.replaceState(null, "", `#${parts.join("&")}`);
   }
+}
+
+/** The pose whose reasons the page shows. */
+let explained = "";
+
+/** Shows why the pose of the chosen bird has its flag, and marks its worst keypoint. */
+async function showWhy() {
+  const column = state.columns[0], n = column.facts.tracks.findIndex((track) => state.selected.has(track.id));
+  const t = column.positions.get(state.frames[state.i]) ?? -1, pose = n < 0 || t < 0 ? "" : `why/${n * column.facts.frames.length + t}`;
+  if (isSaved || state.playing || pose === explained) return;
+  explained = pose;
+  mark(null);
+  if (!pose) return find("why").replaceChildren();
+  await new Promise((done) => setTimeout(done, WHY_MS));
+  if (pose !== explained) return; // the reader goes on
+  const { facts } = await arrays(0, pose), why = find("why"), title = document.createElement("h2");
+  if (pose !== explained) return;
+  const flag = document.createElement("b");
+  flag.className = "flag";
+  flag.textContent = facts.flag;
+  flag.style.background = column.facts.flag_colours[column.facts.flags.indexOf(facts.flag)] ?? "";
+  title.append(`Bird ${column.facts.tracks[n].id}: `, flag);
+  const doubts = document.createElement("ul");
+  doubts.append(...facts.doubts.map((/** @type {string} */ doubt) => Object.assign(document.createElement("li"), { textContent: doubt })));
+  const measures = table(["", "here", "usual"], facts.measures.map((/** @type {any} */ each) => [each.title, each.here, each.usual]));
+  facts.measures.forEach((/** @type {any} */ each, /** @type {number} */ row) => measures.rows[row + 1].classList.toggle("problem", each.bad));
+  const worst = table(["Keypoint off by", "px", "usual", "conf."], facts.keypoints.slice(0, WORST).map((/** @type {any} */ each) => [each.name, each.px.toFixed(1), each.usual_px?.toFixed(1) ?? "", each.confidence.toFixed(2)]));
+  facts.keypoints.slice(0, WORST).forEach((/** @type {any} */ each, /** @type {number} */ row) => {
+    worst.rows[row + 1].onmouseenter = () => mark(each);
+    worst.rows[row + 1].onmouseleave = () => mark(facts.keypoints[0]);
+  });
+  why.replaceChildren(title, doubts, measures, worst);
+  why.hidden = false;
+  mark(facts.keypoints[0] ?? null);
+}
+
+/** Draws one keypoint of the chosen bird in red. @param {{k: number, name: string, px: number} | null} keypoint */
+function mark(keypoint) {
+  for (const film of state.columns[0].films) {
+    film.marked = keypoint && { k: keypoint.k, text: `${keypoint.name} ${keypoint.px.toFixed(1)} px` };
+    film.redraw();
+  }
+}
+
+/** @param {string[]} head @param {string[][]} rows */
+function table(head, rows) {
+  const made = document.createElement("table");
+  for (const cells of [head, ...rows]) {
+    const row = made.insertRow();
+    for (const text of cells) row.insertCell().textContent = text;
+  }
+  return made;
 }
 
 /** @param {number} i position of a frame */
