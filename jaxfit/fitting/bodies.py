@@ -55,6 +55,7 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import NamedTuple, cast
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import block_diag
@@ -157,6 +158,7 @@ def body_evidence(program: Program, problems: Problem, pose: Pose) -> tuple[list
     found, reasons = [], []
     posteriors = window_posteriors(program, problems, pose)
     misfits, fitted_px = window_misfits(program, problems, pose, posteriors)
+    problems, pose = jax.tree.map(np.asarray, (problems, pose))
     for b, posterior in enumerate(posteriors):
         values = [np.asarray(getattr(pose, name)[b], np.float64) for name in program.shared]
         mean = np.concatenate(values)

@@ -29,11 +29,11 @@ The error bars are those of the reported pose. Where a second pose explains the 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,6 +50,7 @@ from jaxfit.fitting.sandwich import (
     spread,
     time_factor,
 )
+from jaxfit.fitting.stored_programs import StoredProgram
 from jaxfit.model.kinematics import (
     Pose,
     window_keypoint_derivatives,
@@ -188,9 +189,11 @@ class _Keypoints(NamedTuple):
     points_cam: Float[Array, "*B T K 3"]
     derivative: Float[Array, "*B T K 3 D"]
     """In the columns of `curvature.frame_rows`."""
+    tangents: Float[Array, "*B T J 3 3"]
+    """Jr of each rotation."""
 
 
-@eqx.filter_jit
+@functools.partial(StoredProgram, structure=lambda program, problems, pose: _Keypoints(0, 0, 0))
 def _keypoints_and_derivatives(program: Program, problems: Problem, pose: Pose) -> _Keypoints:
     def one(pose: Pose) -> _Keypoints:
         A = window_transforms(program.rig, pose)
@@ -200,7 +203,9 @@ def _keypoints_and_derivatives(program: Program, problems: Problem, pose: Pose) 
         scale = jnp.broadcast_to(pose.scale, points.shape[:1])
         by_scale = (points - pose.transl[:, None]) / scale[:, None, None]
         by_shared = (window_keypoint_derivatives(program.rig, A, pose, name) for name in program.shared)
-        return _Keypoints(points, jnp.concatenate([by_angles, axes, by_scale[..., None], *by_shared], axis=-1))
+        derivative = jnp.concatenate([by_angles, axes, by_scale[..., None], *by_shared], axis=-1)
+        angles = jnp.concatenate([pose.global_orient[:, None], pose.body_pose], axis=1)
+        return _Keypoints(points, derivative, right_jacobian(angles))
 
     return jax.vmap(one)(pose)
 
@@ -244,7 +249,7 @@ def _error_bars(
     numbers = {"bone_length": bones, "betas": len(pose.betas)}
     ends = np.cumsum([at_scale + 1, *(numbers[name] for name in program.shared)])
     shared_variance = {name: variance[:, a:b] for name, a, b in zip(program.shared, ends[:-1], ends[1:], strict=True)}
-    angles_sd = _tangent_sd(pose, columns, covariance)
+    angles_sd = _tangent_sd(np.asarray(keypoints.tangents, np.float64), columns, covariance)
     transl_cov = _propagate(by_transl[:, None][..., columns], covariance)[:, 0]
     values = ErrorBars(
         global_orient_sd=angles_sd[:, 0] ** 2,
@@ -285,10 +290,11 @@ def _propagate(J: Float[np.ndarray, "T K R P"], covariance: Float[np.ndarray, "T
     return half @ J.swapaxes(-1, -2)
 
 
-def _tangent_sd(pose: Pose, columns: np.ndarray, covariance: np.ndarray) -> Float[np.ndarray, "T J 3"]:
+def _tangent_sd(
+    Jr: Float[np.ndarray, "T J 3 3"], columns: np.ndarray, covariance: np.ndarray
+) -> Float[np.ndarray, "T J 3"]:
     """Return the standard deviations of the tangents δ of all rotations; 0 for rotations that are fixed."""
-    angles = np.concatenate([pose.global_orient[:, None], pose.body_pose], axis=1)
-    T, J, _ = angles.shape
+    T, J, _, _ = Jr.shape
     full = np.zeros((T, J, 3, 3))
     position = np.full(3 * J, -1)
     inside = columns < 3 * J
@@ -298,7 +304,6 @@ def _tangent_sd(pose: Pose, columns: np.ndarray, covariance: np.ndarray) -> Floa
         if (at >= 0).all():
             full[:, j] = covariance[:, at[:, None], at]
     # exp(r + dr) = exp(r)·exp(Jr(r)·dr) to first order, so δ = Jr·dr has the covariance Jr·Σ·Jrᵀ
-    Jr = np.asarray(right_jacobian(jnp.asarray(angles, jnp.float32)), np.float64)
     return np.sqrt(np.einsum("tjab,tjbc,tjac->tja", Jr, full, Jr))
 
 

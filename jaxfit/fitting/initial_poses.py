@@ -9,7 +9,6 @@ temporal terms corrects such a flip.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +24,7 @@ from jaxfit.data.observations import MIN_KEYPOINTS, Observations
 from jaxfit.data.solution import LAYOUT, check_poses
 from jaxfit.data.tracks import positions_in
 from jaxfit.fitting.outlines import OUTLINE_KEYPOINTS, OutlineMatch
+from jaxfit.fitting.stored_programs import StoredProgram
 from jaxfit.fitting.tiles import join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.array_files import load_npz, npz_names, validate_arrays
@@ -210,10 +210,13 @@ def search_initial_poses(
         _search_tile(bird, rig, *take_tile((keypoints_px, confidence, outlines), rows), config, camera, common_size)
         for rows in tile_rows(count, tile_size(frames))
     ]
-    return jax.device_put(join_tiles(found, count))
+    orient, transl, scale = join_tiles(found, count)
+    hypotheses = orient.shape[:2]
+    rest = jax.tree.map(lambda x: np.broadcast_to(x, (*hypotheses, *np.shape(x))), rest_pose(bird, frames, common_size))
+    return jax.device_put(replace(rest, global_orient=orient, transl=transl, scale=scale))
 
 
-@partial(jax.jit, static_argnames=("config", "camera", "common_size"))
+@partial(StoredProgram, structure=lambda *arguments: (0, 0, 0))
 def _search_tile(
     bird: Bird,
     rig: Rig,
@@ -223,8 +226,8 @@ def _search_tile(
     config: InitialiseConfig,
     camera: CropCamera,
     common_size: bool,
-) -> Pose:
-    """Return the initial poses of the G windows of a tile."""
+) -> tuple[Float[Array, "G H T 3"], Float[Array, "G H T 3"], Float[Array, "G H scales"]]:
+    """Return orientation, translation and scale of the initial poses of the G windows of a tile."""
     frames = keypoints_px.shape[1]
     rest = rest_pose(bird)
     model_keypoints, root = posed_keypoints(rig, joint_transforms(rig, rest), rest), rig.joints[0]
@@ -260,11 +263,7 @@ def _search_tile(
         return jax.vmap(lambda R, scale_px, chosen: initial_pose(R, scale_px, chosen, *targets))(*found)
 
     batch_size = max(1, 100 // frames)  # a window of 100 frames × 2,400 candidates needs about 100 MB
-    orient, transl, scale = jax.lax.map(search_window, (keypoints_px, confidence, outlines), batch_size=batch_size)
-    rest_poses = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (*orient.shape[:2], *x.shape)), rest_pose(bird, frames, common_size)
-    )
-    return dataclasses.replace(rest_poses, global_orient=orient, transl=transl, scale=scale)
+    return jax.lax.map(search_window, (keypoints_px, confidence, outlines), batch_size=batch_size)
 
 
 _FIELDS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "crop")

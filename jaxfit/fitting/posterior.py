@@ -24,10 +24,10 @@ approximation); Takahashi et al. 1973, *Formation of a sparse bus impedance matr
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +37,7 @@ from scipy.linalg import cho_solve, get_lapack_funcs
 from jaxfit.config.fit import StageConfig
 from jaxfit.fitting.problem import Problem, Program, problem_window
 from jaxfit.fitting.solve import shared_parameters
+from jaxfit.fitting.stored_programs import StoredProgram
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.curvature import frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature
@@ -199,7 +200,7 @@ class Products(NamedTuple):
     """H times `change`."""
 
 
-@eqx.filter_jit
+@functools.partial(StoredProgram, structure=lambda program, problems, pose: Products(0, 0, 0, 0))
 def curvature_products(program: Program, problems: Problem, pose: Pose) -> Products:
     """Return the products from which `blocks_of` assembles the curvature of each of B problems."""
 

@@ -114,7 +114,7 @@ def begin(program: Program, problems: Problem, carried: Any) -> StageState:
     return StageState(*copies, started=jnp.bool_(False))
 
 
-@functools.partial(StoredProgram, structure=lambda fixed, state: (state, 0, 0))
+@functools.partial(StoredProgram, structure=lambda fixed, state: (state, 0, 0), reuses_state=True)
 def advance(
     fixed: tuple[Program, Problem, Int[Array, ""]], state: StageState
 ) -> tuple[StageState, Float[Array, "B"], Int[Array, "B"]]:
@@ -148,7 +148,9 @@ class Report(NamedTuple):
     """Crop pixels."""
 
 
-@eqx.filter_jit
+@functools.partial(
+    StoredProgram, structure=lambda program, problems, pose: Report(dict.fromkeys(program.terms, 0), 0, 0)
+)
 def report(program: Program, problems: Problem, pose: Pose) -> Report:
     """Evaluate the objective at a batch of poses. A solver's state has only the loss before its last step."""
 

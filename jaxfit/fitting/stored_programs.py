@@ -22,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.export
 
+from jaxfit.config.fit import InitialiseConfig
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
 from jaxfit.objective.registry import Term
@@ -40,30 +41,32 @@ CHECKSUM = hashlib.sha256
 
 
 class StoredProgram:
-    """A compiled function (fixed, state) → result whose trace is stored. It reuses the memory of `state`.
+    """A compiled function whose trace is stored.
 
     Without a local cache folder, with a device other than CPUs, and for arguments that have no key, it is compiled by
     `eqx.filter_jit` as usual.
     """
 
-    def __init__(self, function: Callable[[Any, Any], Any], structure: Callable[[Any, Any], Any]):
+    def __init__(self, function: Callable[..., Any], structure: Callable[..., Any], reuses_state: bool = False):
         """Compile a function.
 
         Args:
-            function: a pure function (fixed, state) → pytree of arrays.
+            function: a pure function, whose result is a pytree of arrays.
             structure: returns from the same arguments a pytree with the structure of the result, with any leaves.
+            reuses_state: whether the result takes the memory of the second and last argument.
         """
         self._function = function
         self._structure = structure
-        self._compiled = eqx.filter_jit(function, donate="all-except-first")
+        self._reuses_state = reuses_state
+        self._compiled = eqx.filter_jit(function, donate="all-except-first" if reuses_state else "none")
         self._loaded: dict[str, Callable[..., list]] = {}
         functools.update_wrapper(self, function)
 
-    def __call__(self, fixed: Any, state: Any) -> Any:
-        arguments, others = eqx.partition((fixed, state), eqx.is_array)
+    def __call__(self, *all_arguments: Any) -> Any:
+        arguments, others = eqx.partition(all_arguments, eqx.is_array)
         key = _key(self._function, arguments, others)
         if key is None:
-            return self._compiled(fixed, state)
+            return self._compiled(*all_arguments)
         leaves = [jax.tree.leaves(part) for part in arguments]
         if key not in self._loaded:
             if len(self._loaded) == MAX_LOADED:
@@ -71,12 +74,12 @@ class StoredProgram:
             program = self._traced(key, leaves, [*map(jax.tree.structure, arguments)], others)
             call = functools.update_wrapper(lambda *leaves: program.call(*leaves), self._function)
             # a jitted function would be compiled once more for its own results, which are bound to a device
-            self._loaded[key] = jax.jit(call, donate_argnums=1).lower(*leaves).compile()
+            self._loaded[key] = jax.jit(call, donate_argnums=(1,) * self._reuses_state).lower(*leaves).compile()
         result = self._loaded[key](*leaves)
-        return jax.tree.unflatten(jax.tree.structure(self._structure(fixed, state)), result)
+        return jax.tree.unflatten(jax.tree.structure(self._structure(*all_arguments)), result)
 
     def _traced(self, key: str, leaves: list, structures: list, others: Any) -> jax.export.Exported:
-        """Return the stored program, a function of two lists of arrays. Trace and store it first where it is not."""
+        """Return the stored program, a function of lists of arrays. Trace and store it first where it is not."""
         path = Path(getattr(jax.config, FOLDER)) / "traced" / key
         stored = _read(path)
         if stored is not None:
@@ -114,7 +117,7 @@ def _key(function: Callable, arguments: Any, others: Any) -> str | None:
     described = [_described(leaf) for leaf in (function, *jax.tree.leaves(others))]
     if None in described:
         return None
-    arrays = [(x.shape, x.dtype.name, x.weak_type) for x in jax.tree.leaves(arguments)]
+    arrays = [(x.shape, x.dtype.name, getattr(x, "weak_type", False)) for x in jax.tree.leaves(arguments)]
     structures = jax.tree.structure(arguments), jax.tree.structure(others)
     settings = [getattr(jax.config, name) for name in SETTINGS]
     settings.append(jax.config.read("jax_disable_most_optimizations"))  # it decides the compilation
@@ -130,7 +133,7 @@ def _described(leaf: Any) -> str | None:
     if isinstance(leaf, FunctionType):  # the key holds the source of the package, so the line determines the function
         ours = leaf.__module__.startswith("jaxfit.") and leaf.__closure__ is None
         return f"{leaf.__module__} {leaf.__qualname__} {leaf.__code__.co_firstlineno}" if ours else None
-    return repr(leaf) if isinstance(leaf, str | int | float | Blur | None) else None
+    return repr(leaf) if isinstance(leaf, str | int | float | Blur | InitialiseConfig | None) else None
 
 
 @functools.cache

@@ -7,11 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.stages import CONFIG, FIRST, case, problems, program, row
+from support.stages import BIRD, CONFIG, FIRST, case, problems, program, row
 
 import jaxfit
+from jaxfit.config.fit import InitialiseConfig
 from jaxfit.fitting import stored_programs
-from jaxfit.fitting.solve import advance, begin
+from jaxfit.fitting.error_bars import _keypoints_and_derivatives
+from jaxfit.fitting.initial_poses import _search_tile
+from jaxfit.fitting.posterior import curvature_products
+from jaxfit.fitting.solve import advance, begin, report
 from jaxfit.fitting.stored_programs import StoredProgram
 from jaxfit.objective import registry
 from jaxfit.objective.residuals import Residuals
@@ -47,7 +51,7 @@ def arguments(stage=FIRST, birds=2, config=CONFIG, started=True):
 def take_steps(*chosen):
     """Take three steps as a process that has not taken any before."""
     fixed, state = chosen or arguments()
-    return StoredProgram(advance.__wrapped__, lambda fixed, state: (state, 0, 0))(fixed, state)
+    return StoredProgram(advance.__wrapped__, lambda fixed, state: (state, 0, 0), reuses_state=True)(fixed, state)
 
 
 def fall(fixed, state):
@@ -113,6 +117,22 @@ def key(**change):
     found = stored_programs._key(advance.__wrapped__, arrays, others)
     assert found is not None
     return found
+
+
+def test_every_large_program_of_a_fit_is_stored(folder):
+    (own, several, _), pose = arguments(started=False)
+    bird, how = BIRD, InitialiseConfig(method="so3")
+    search = (bird, own.rig, several.targets.keypoints_px, several.targets.confidence, None, how, own.camera, True)
+    programs = [(_search_tile, search)]
+    programs += [(each, (own, several, pose)) for each in (report, curvature_products, _keypoints_and_derivatives)]
+    keys = []
+    for function, given in programs:
+        assert isinstance(function, StoredProgram)
+        keys.append(stored_programs._key(function.__wrapped__, *eqx.partition(given, eqx.is_array)))
+    other_search = (*search[:5], InitialiseConfig(), *search[6:])
+    keys.append(stored_programs._key(_search_tile.__wrapped__, *eqx.partition(other_search, eqx.is_array)))
+    assert None not in keys
+    assert len(set(keys)) == len(keys)
 
 
 def test_numbers_do_not_change_the_key(folder):
