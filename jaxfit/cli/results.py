@@ -11,6 +11,7 @@ from jaxfit.cli.tables import right_aligned, show, track_table
 from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import terminal
 from jaxfit.review.edits import EXAMPLES, Edit, parse_edit, read_edits
+from jaxfit.review.points import Point
 
 
 def tracks(options: argparse.Namespace) -> None:
@@ -76,7 +77,7 @@ def _list(options: argparse.Namespace) -> None:
         show(track_table(read_observations(path)))
 
 
-def _edit(kind: str, text: str) -> Edit:
+def _edit(kind: str, text: str) -> Edit | Point:
     """Return the edit of an option such as `--swap 3,5@120:140`."""
     try:
         return parse_edit(f"{kind} {text}", f"--{kind}")

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.masks import decode_mask
-from jaxfit.data.observations import FrameMasks, Observations
+from jaxfit.data.observations import FROM_LABEL, FrameMasks, Observations
 from jaxfit.data.tracks import assumed_interval_s, frame_interval_s, frame_step
 from jaxfit.fitting.crops import crop_squares, cut_mask, mark_unknown
 from jaxfit.foundation.array_files import MAX_TABLE_GB, check_memory
@@ -359,7 +359,10 @@ def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray
 
 
 def filter_observations(observations: Observations, window: int) -> Observations:
-    """Smooth every track with the weighted median filter. Missing frame numbers count as frames without keypoints."""
+    """Smooth every track with the weighted median filter. Missing frame numbers count as frames without keypoints.
+
+    Keypoints that a person has placed stay as they are.
+    """
     if window == 1 or observations.num_frames == 1:
         return observations
     line = _timeline(observations)
@@ -374,6 +377,10 @@ def filter_observations(observations: Observations, window: int) -> Observations
         some = slice(first, first + at_once)
         confidence = np.where(known[None, :, None], observations.confidence[some, at], 0)
         filtered[some] = np.asarray(_filter_birds(observations.keypoints_px[some, at], confidence, window))[:, known]
+    is_label = (cast(np.ndarray, observations.keypoint_origin) == FROM_LABEL)[..., None] & (
+        observations.confidence == 1
+    )
+    filtered[is_label] = observations.keypoints_px[is_label]
     return observations.with_keypoints(filtered, observations.confidence)
 
 

@@ -29,6 +29,7 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.reading import read_file
 from jaxfit.model.bird import Bird
 from jaxfit.review.edits import Edit, apply_edits
+from jaxfit.review.points import Point
 
 
 class Refit(NamedTuple):
@@ -250,7 +251,7 @@ def read_tracks(result: str | Path, observations: str | Path | None = None) -> T
 def correct_tracks(
     result: str | Path,
     out: str | Path,
-    edits: Sequence[Edit],
+    edits: Sequence[Edit | Point],
     observations: str | Path | None = None,
     overwrite: bool = False,
     progress: ProgressTask = silent,

@@ -1,4 +1,4 @@
-"""Edits of the tracks of observations (swap, cut, join, delete, exclude), and their form as text."""
+"""Edits of observations as text: of tracks (swap, cut, join, delete, exclude), and of keypoints (`points`)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from jaxfit.data.observations import CELLS, MAPPINGS, Observations
 from jaxfit.foundation.array_files import check_memory, observations_bytes
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import read_text
+from jaxfit.review.points import POINT_EXAMPLES, Point, parse_point, with_points
 
 EXAMPLES = {"swap": "3,5@120:200", "cut": "4@80", "join": "2,7", "delete": "6", "exclude": "3@10:20"}
 """Kind of an edit → example of its tracks and frames."""
@@ -44,20 +45,22 @@ class Edit(NamedTuple):
         return f"{self.kind} {tracks}@{start}{stop}" if start or stop else f"{self.kind} {tracks}"
 
 
-def parse_edit(text: str, source: object) -> Edit:
+def parse_edit(text: str, source: object) -> Edit | Point:
     """Return an edit from its form as text.
 
     Args:
         text: kind, tracks and frames, for example ``swap 3,5@120:200``, ``cut 4@80``, ``join 2,7``, ``delete 6`` or
             ``exclude 3@10:20``. Frames are numbers; the number after the colon is the end, which is not included.
             ``@120`` reaches to the end of the observations, ``@:200`` begins at their start. A swap without frames
-            means all frames.
+            means all frames. Keypoints have the form of `parse_point`.
         source: the file or the option, for messages.
 
     Raises:
         InputError: the kind is unknown, the number of tracks is not that of the kind, a cut names no frame or an end,
             an exclusion names no frames, or a join or a deletion names frames.
     """
+    if text.partition(" ")[0] in POINT_EXAMPLES:
+        return parse_point(text, source)
     match = _FORM.fullmatch(text)
     kind, named, *ends = match.groups() if match else (text.partition(" ")[0], "", None, None)
     numbers = tuple(int(part) for part in named.split(",") if part)
@@ -77,7 +80,7 @@ def parse_edit(text: str, source: object) -> Edit:
     return Edit(kind, numbers, start, stop)
 
 
-def read_edits(path: str | Path) -> list[Edit]:
+def read_edits(path: str | Path) -> list[Edit | Point]:
     """Read a text file with one edit a line, in the form of `parse_edit`.
 
     Empty lines, lines that begin with ``#``, and spaces at the ends of a line are ignored.
@@ -97,7 +100,7 @@ def read_edits(path: str | Path) -> list[Edit]:
     return edits
 
 
-def edits_text(edits: Sequence[Edit], before: str = "") -> str:
+def edits_text(edits: Sequence[Edit | Point], before: str = "") -> str:
     """Return the content of a file of edits, which `read_edits` reads; one line per edit.
 
     Args:
@@ -123,8 +126,13 @@ def edits_text(edits: Sequence[Edit], before: str = "") -> str:
     return "".join(f"{line}\n" for line in [*kept, *lines[equal:]])
 
 
-def apply_edits(observations: Observations, edits: Sequence[Edit], source: object) -> Observations:
-    """Return the observations after all edits, one after the other.
+def apply_edits(
+    observations: Observations, edits: Sequence[Edit | Point], source: object, only_labels: bool = False
+) -> Observations:
+    """Return the observations after all edits: first those of keypoints, then those of tracks, one after the other.
+
+    So a keypoint names its bird as the result does, and not as an earlier edit of tracks does. With `only_labels`, all
+    keypoints are removed that no person has placed or accepted.
 
     A new track gets the next free number. A track without a frame is removed. The frames stay, also those without a
     bird. The arrays are moved once, after the last edit, so the time is linear in the number of edits.
@@ -133,6 +141,14 @@ def apply_edits(observations: Observations, edits: Sequence[Edit], source: objec
         InputError: a track or frame is not there, a track is named twice, joined tracks share a frame, the tracks need
             too much memory, or no track would be left.
     """
+    points = [edit for edit in edits if isinstance(edit, Point)]
+    if points or only_labels:
+        observations, labelled = with_points(observations, points, source)
+        if only_labels:
+            observations = observations.with_keypoints(
+                np.where(labelled[..., None], observations.keypoints_px, 0), labelled.astype(np.float32)
+            )
+    edits = [edit for edit in edits if not isinstance(edit, Point)]
     N, T, K = observations.confidence.shape
     numbers = observations.frame_index
     first, last = int(numbers[0]), int(numbers[-1])

@@ -84,7 +84,11 @@ class Viewer:
         """Return what the page needs first."""
         corrections = None
         if self.session is not None:
-            corrections = {"edits": [str(edit) for edit in self.session.edits], "file": str(self.session.edits_path)}
+            corrections = {
+                "edits": [str(edit) for edit in self.session.edits],
+                "file": self.session.edits_path.name,
+                "labels": self.session.labels_path.name,
+            }
         return {
             "results": [each.facts() for each in self.results],
             "film": self.film,
@@ -138,7 +142,7 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         action = request.path_params["action"]
         if action == "edits":
             await run_in_threadpool(session.set_edits, _list_of(sent, "edits", str), _list_of(sent, "known", str))
-            return JSONResponse({})
+            return JSONResponse({"edits": list(map(str, session.edits))})
         if action == "refit":
             known = _list_of(sent, "known", str)
             work = session.refit(lambda out: viewer.results.append(viewer.open_result(out)), known)

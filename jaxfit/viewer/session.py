@@ -6,16 +6,20 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from threading import Lock, Thread
 from typing import Any
 
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.progress import ReportProgress
 from jaxfit.foundation.reading import read_text
-from jaxfit.review.correct import correct_tracks
-from jaxfit.review.edits import Edit, edits_text, parse_edit, read_edits
+from jaxfit.review.correct import correct_tracks, read_tracks
+from jaxfit.review.edits import Edit, apply_edits, edits_text, parse_edit, read_edits
+from jaxfit.review.points import Point
 from jaxfit.review.suggest import suggest_marked
 
 
@@ -73,7 +77,8 @@ class Session:
 
     def __init__(self, folder: Path, edits_path: Path, observations: Path | None, video: Path | None):
         self.folder, self.edits_path, self.observations, self.video = folder, edits_path, observations, video
-        self.edits: list[Edit] = read_edits(edits_path) if edits_path.exists() else []
+        self.labels_path = edits_path.with_name(f"{edits_path.name}.labels.json")
+        self.edits: list[Edit | Point] = read_edits(edits_path) if edits_path.exists() else []
         self.work: Work | None = None
         self._lock = Lock()
 
@@ -91,9 +96,22 @@ class Session:
         edits = [parse_edit(text, "edit of the page") for text in texts]
         with self._lock:
             self._check_known(known)
+            self._write_labels(edits)
             before = read_text(self.edits_path, "corrections") if self.edits_path.exists() else ""
             write_whole(self.edits_path, edits_text(edits, before).encode())
             self.edits = edits
+
+    @cached_property
+    def _detected(self) -> Observations:
+        return read_tracks(self.folder, self.observations).observations
+
+    def _write_labels(self, edits: list[Edit | Point]) -> None:
+        """Write the keypoints of the person as labels, which `reconstruct --labels` and `train` read."""
+        if any(isinstance(edit, Point) for edit in edits):
+            labels = apply_edits(self._detected, edits, self.folder, only_labels=True)
+            write_coco(labels.select(frames=(labels.confidence > 0).any((0, 2))), self.labels_path)
+        else:
+            self.labels_path.unlink(missing_ok=True)
 
     def _check_known(self, known: list[str]) -> None:
         self.edits = read_edits(self.edits_path) if self.edits_path.exists() else []

@@ -17,6 +17,7 @@ from jaxfit.behaviour.describe import describe
 from jaxfit.behaviour.registry import find_feature, own_features
 from jaxfit.cameras.files import read_cameras
 from jaxfit.data.flags import FLAGS, flags, keypoint_distances
+from jaxfit.data.keypoint_names import opposite_keypoints
 from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.projection import PosedBirds, image_focal_px, in_image
 from jaxfit.data.result_folder import CAMERAS
@@ -131,6 +132,7 @@ class Shown:
             "frames_of_part": FRAMES,
             "skeleton": [list(pair) for pair in skeleton_pairs(s.keypoint_names)],
             "keypoints": list(s.keypoint_names),
+            "opposite": [k if other < 0 else other for k, other in enumerate(opposite_keypoints(s.keypoint_names))],
             "flags": list(FLAGS),
             "flag_colours": [FLAG_COLOURS[flag] for flag in FLAGS],
             "values": self.kinds_of_values,

@@ -12,8 +12,10 @@ from jaxfit.cli.main import main
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.tracks import track_quality
+from jaxfit.fitting.windows import filter_observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.review.edits import EXAMPLES, Edit, apply_edits, edits_text, parse_edit, read_edits
+from jaxfit.review.points import POINT_EXAMPLES, Point
 
 TEXTS = {
     "swap 3,5": Edit("swap", (3, 5)),
@@ -28,6 +30,11 @@ TEXTS = {
     "exclude 3@10": Edit("exclude", (3,), 10),
     "exclude 3@:20": Edit("exclude", (3,), None, 20),
     "exclude 3@0": Edit("exclude", (3,), 0),
+    "place 3@120 bill_tip 812.4,-300": Point("place", 3, 120, "bill_tip", (812.4, -300.0)),
+    "place 3@120 the left eye 8,3": Point("place", 3, 120, "the left eye", (8.0, 3.0)),
+    "hide 3@120 bill_tip": Point("hide", 3, 120, "bill_tip"),
+    "mirror 3@120": Point("mirror", 3, 120),
+    "accept 3@120": Point("accept", 3, 120),
 }
 
 
@@ -79,6 +86,53 @@ def test_a_track_without_frames_disappears():
         apply_edits(before, [Edit("delete", (5,)), Edit("exclude", (5,), 100)], "x")
 
 
+def test_keypoints_are_placed_hidden_exchanged_and_accepted():
+    before, cell = observations(), (1, 4)  # track 4, frame 104
+    sure = before.with_keypoints(before.keypoints_px, before.confidence * 0.5)
+    k, left, right = (before.keypoint_names.index(name) for name in ("crown", "left_eye", "right_eye"))
+    points = [Point("place", 4, 104, "crown", (60.0, 3.5)), Point("hide", 4, 104, "nape"), Point("mirror", 4, 104)]
+    after = apply_edits(sure, points, "x")
+    assert (after.keypoints_px[*cell, k].tolist(), after.confidence[*cell, k]) == ([60.0, 3.5], 1)
+    assert after.confidence[*cell, before.keypoint_names.index("nape")] == 0
+    np.testing.assert_array_equal(after.keypoints_px[*cell, left], before.keypoints_px[*cell, right])
+    x, y, width, _ = after.box_px[cell]
+    assert (x + width, y) == (pytest.approx(60), 3.5)
+    others = np.ones(before.present.shape, bool)
+    others[cell] = False
+    for name in ("keypoints_px", "confidence", "box_px"):
+        np.testing.assert_array_equal(getattr(after, name)[others], getattr(sure, name)[others])
+    labels = apply_edits(sure, points, "x", only_labels=True)
+    assert np.argwhere(labels.confidence).tolist() == [[*cell, k]]
+    accepted = apply_edits(sure, [*points, Point("accept", 4, 104)], "x", only_labels=True)
+    assert set(accepted.confidence[cell]) == {0, 1}
+    assert (accepted.confidence > 0).sum() == before.num_keypoints - 1  # one is hidden
+
+
+def test_keypoints_name_the_bird_of_the_result_and_the_filter_leaves_them():
+    edits = [Edit("swap", (2, 4)), Point("place", 4, 104, "crown", (60.0, 3.5))]
+    after = apply_edits(observations(), edits, "x")
+    k = after.keypoint_names.index("crown")
+    assert after.track_id.tolist() == [2, 4, 5]
+    assert after.keypoints_px[0, 4, k].tolist() == [60.0, 3.5]
+    filtered = filter_observations(after, 5)
+    assert filtered.keypoints_px[0, 4, k].tolist() == [60.0, 3.5]
+    assert np.linalg.norm(filtered.keypoints_px[0, 5, k] - after.keypoints_px[0, 5, k]) < 5
+
+
+@pytest.mark.parametrize(
+    ("point", "message"),
+    [
+        (Point("place", 4, 104, "crown", (64.5, 3.0)), "outside the picture of 64×64"),
+        (Point("place", 4, 104, "knee", (6.0, 3.0)), "there is no such keypoint"),
+        (Point("mirror", 9, 104), "bird 9 is not in frame 104"),
+        (Point("accept", 5, 113), "bird 5 is not in frame 113"),
+    ],
+)
+def test_wrong_keypoints_are_one_line(point, message):
+    with pytest.raises(InputError, match=message):
+        apply_edits(observations(), [point], "x")
+
+
 def test_many_edits_move_the_arrays_once(tmp_path, monkeypatch):
     path, moves = tmp_path / "edits.txt", []
     path.write_text("cut 4@110\n" * 120_000)
@@ -104,6 +158,15 @@ def test_the_text_of_an_edit(text):
 
 WRONG = [
     *("swap 3", "swap 3,5@:", "swap 3, 5", "Swap 3,5", "cut 4", "cut 4@80:90", "cut 4,5@80", "join 2,7@10", "delete"),
+    *(
+        "place 3@10 bill_tip",
+        "place 3@10 1,2",
+        "hide 3@10",
+        "hide 3@10 a 1,2",
+        "mirror 3",
+        "accept 3@1 a",
+        "place 3,4@1 a 1,2",
+    ),
     *("exclude 3", "exclude 3,4@10:20", "exclude 3@1.5", "", "split 3@10", "delete 6\n", "cut 4@" + 19 * "1"),
 ]
 
@@ -113,8 +176,9 @@ def test_other_texts_are_not_edits(text):
     with pytest.raises(InputError, match="is not a correction") as caught:
         parse_edit(text, "birds.txt")
     kind = text.split(" ")[0]
-    for each in [kind] if kind in EXAMPLES else EXAMPLES:
-        assert f"{each} {EXAMPLES[each]}" in caught.value.remedy
+    examples = EXAMPLES | POINT_EXAMPLES
+    for each in [kind] if kind in examples else EXAMPLES:
+        assert f"{each} {examples[each]}" in caught.value.remedy
     assert ("delete removes all frames of a track" in caught.value.remedy) == (kind == "exclude")
 
 
@@ -127,6 +191,7 @@ EDITS = st.one_of(
     st.builds(Edit, st.just("delete"), st.lists(TRACK, min_size=1, max_size=4).map(tuple), st.none(), st.none()),
     st.builds(Edit, st.just("exclude"), st.tuples(TRACK), FRAME, st.none() | FRAME),
     st.builds(Edit, st.just("exclude"), st.tuples(TRACK), st.none(), FRAME),
+    st.builds(Point, st.just("mirror"), TRACK, FRAME, st.just(""), st.none()),
 )
 
 

@@ -1,5 +1,6 @@
 """The page in Chromium: film, birds in 3D and timeline show one moment; clicks, keys, corrections, saved pages."""
 
+import dataclasses
 import json
 import shutil
 import subprocess
@@ -11,10 +12,17 @@ import av
 import cv2
 import numpy as np
 import pytest
-from support import films, overlays
+from support import corrected, films, overlays
 from support.viewed import served, shown, unpacked, write_result
 
+import jaxfit
 from jaxfit.cli.view import leading_page
+from jaxfit.config.yaml_file import config_to_yaml
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.solution import load_solution, save_solution
+from jaxfit.learning.networks.labels import read_labels
+from jaxfit.perception.label_flow import read_few_labels
+from jaxfit.review.edits import read_edits
 from jaxfit.video.reader import read_frames
 from jaxfit.viewer import session
 from jaxfit.viewer.page import ASSETS
@@ -382,6 +390,97 @@ def test_corrections_and_the_fit_after_them(page, monkeypatch, tmp_path):
     opened.page.click("#refit")
     opened.until("jaxfit.state.columns.length === 2")
     assert calls == [["cut 4@5"]]
+
+
+IN_CLOSE = IN_FILM.replace("columns[0].film,", "columns[0].films[0],").replace("value + 0.5", "value")
+"""The place in the window of a point of the film, in the view of the chosen bird."""
+
+
+def drag(opened, start, end):
+    """Drag a keypoint of the chosen bird from one point of the film to another."""
+    for move, point in ((False, start), (True, end)):
+        opened.page.mouse.move(*opened.page.evaluate(IN_CLOSE, list(map(float, point))), steps=3)
+        opened.page.mouse.up() if move else opened.page.mouse.down()
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory):
+    """A fit of toy birds: the bill of bird 4 is detected 12 px beside its place in frames 102 to 106."""
+    folder = tmp_path_factory.mktemp("wrong")
+    observed = corrected.observations()
+    points = observed.keypoints_px.copy()
+    points[1, 2:7, 0, 0] += 12
+    seen, settings = observed.with_keypoints(points, observed.confidence), corrected.CONFIG
+    settings = dataclasses.replace(settings, stages=(dataclasses.replace(settings.stages[0], steps=60),))
+    save_solution(
+        jaxfit.fit(seen, corrected.BIRD, settings), corrected.BIRD, config_to_yaml(settings), {}, folder / "result"
+    )
+    write_coco(seen, folder / "result" / "observations.json")
+    return folder / "result", overlays.film(folder / "film.mp4", 118, (64, 64)), observed
+
+
+def test_a_dragged_keypoint_is_a_label_and_the_refit_is_better(browser, wrong, tmp_path):
+    folder, video, truth = wrong
+    edits = tmp_path / "result.edits"
+    bill = truth.keypoints_px[1, 4, 0]
+
+    def error_px(result):
+        return float(np.linalg.norm(load_solution(result)[0].keypoints.px[1, 4, 0] - bill))
+
+    with served(folder, video, edits) as (client, viewer):
+        opened = Opened(browser, client.address, "#frame=104&birds=4")
+        opened.until("jaxfit.state.columns[0].films[0].points.length === 12 && !jaxfit.state.busy")
+        opened.page.mouse.move(*opened.page.evaluate(IN_CLOSE, [float(bill[0] + 12), float(bill[1])]))
+        opened.until("jaxfit.state.columns[0].films[0].hovered === 0")
+        drag(opened, bill + np.array([12, 0]), bill)
+        opened.until("document.querySelectorAll('#edits li').length === 1")
+        (edit,) = read_edits(edits)
+        assert (edit.kind, edit.track, edit.frame, edit.keypoint) == ("place", 4, 104, "bill_tip")
+        assert np.linalg.norm(np.array(edit.at_px) - bill) < 0.3
+        opened.page.click("#refit")
+        opened.until("jaxfit.state.columns.length === 2")
+        before, after = error_px(folder), error_px(viewer.results[1].folder)
+        assert before > 2
+        assert after < 0.5
+        opened.close()
+        shutil.rmtree(viewer.results[1].folder)
+    labels = viewer.session.labels_path
+    few = read_few_labels(labels, video, corrected.BIRD.keypoint_names)
+    assert (few.frame_index.tolist(), few.confidence.sum()) == ([104], 1)
+    (picture,) = read_labels([labels], [video]).pictures
+    assert [bird.visibility.sum() for bird in picture.birds if bird.visibility.any()] == [2]
+
+
+def test_keypoints_by_keys_and_outside_the_picture(browser, wrong, tmp_path):
+    folder, video, truth = wrong
+    edits = tmp_path / "result.edits"
+    tail = truth.keypoints_px[1, 4, 7]
+    with served(folder, video, edits) as (client, _):
+        opened = Opened(browser, client.address, "#frame=104&birds=4")
+        opened.until("jaxfit.state.columns[0].films[0].points.length === 12 && !jaxfit.state.busy")
+
+        def stored(count):
+            opened.until(f"document.querySelectorAll('#edits li').length === {count} && !jaxfit.state.busy")
+            return [str(edit) for edit in read_edits(edits)]
+
+        drag(opened, tail, [-6, tail[1]])
+        assert stored(1) == ["hide 4@104 tail_tip"]
+        assert "outside the picture" in opened.page.inner_text("#state")
+        opened.until("jaxfit.state.columns[0].films[0].points[7].at === null")
+        opened.page.keyboard.press("x")
+        opened.page.wait_for_timeout(100)
+        opened.page.keyboard.press("a")
+        assert stored(3)[1:] == ["mirror 4@104", "accept 4@104"]
+        swapped = opened.page.evaluate("jaxfit.state.columns[0].films[0].points[1].at")
+        assert swapped == pytest.approx(truth.keypoints_px[1, 4, 2].tolist(), abs=0.1)
+        for count in (2, 1, 0):
+            opened.page.keyboard.press("Control+z")
+            stored(count)
+        with opened.page.expect_popup() as second:
+            opened.page.evaluate("void window.open(location.href)")
+        second.value.wait_for_selector("#state:has-text('second page')")
+        second.value.close()
+        opened.close()
 
 
 def test_saved_pages_need_no_server_and_no_network(browser, result, tmp_path):

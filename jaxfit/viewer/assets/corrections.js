@@ -4,20 +4,30 @@ import { change, work } from "viewer/data";
 
 const find = (/** @type {string} */ id) => /** @type {HTMLElement} */ (document.getElementById(id));
 const POLL_MS = 400;
+/** An edit of keypoints: kind, track, frame, keypoint, x, y. */
+const POINT = /^(place|hide|mirror|accept) (\d+)@(\d+)(?: (\S.*?))?(?: (-?[\d.]+),(-?[\d.]+))?$/;
 
 export class Corrections {
   /**
-   * @param {{edits: string[], file: string}} facts
-   * @param {{state: () => {frame: number, selected: number[], range: [number | null, number | null]},
-   *   marked: (frames: number[]) => void, refitted: () => void}} page
+   * @param {{edits: string[], file: string, labels: string}} facts
+   * @param {import("viewer/data").ResultFacts} result
+   * @param {{state: () => {frame: number, selected: number[], range: [number | null, number | null]}, changed: () => void,
+   *   show: (frame: number, track: number) => void, marked: (frames: number[]) => void, refitted: () => void}} page
    */
-  constructor(facts, page) {
+  constructor(facts, result, page) {
     this.edits = [...facts.edits];
+    this.result = result;
     this.page = page;
     /** @type {number[]} */
     this.marks = [];
     find("corrections").hidden = false;
-    find("file").textContent = `Saved in ${facts.file}: jaxfit tracks --edits repeats them.`;
+    find("file").textContent = `Saved in ${facts.file}; placed keypoints are also labels in ${facts.labels}.`;
+    this.others = new BroadcastChannel(location.pathname);
+    this.others.onmessage = ({ data }) => {
+      if (data === "open?") this.others.postMessage("open");
+      else this.say("This result is open in a second page. Correct it in one of the two.", true);
+    };
+    this.others.postMessage("open?");
     for (const button of document.querySelectorAll("[data-edit]")) {
       button.addEventListener("click", () => this.add(button.getAttribute("data-edit") ?? ""));
     }
@@ -51,6 +61,52 @@ export class Corrections {
     }
   }
 
+  /**
+   * The keypoints of a bird at the present frame after the corrections.
+   * @param {number} track @param {([number, number] | null)[]} detected
+   */
+  corrected(track, detected) {
+    const { frame } = this.page.state(), { keypoints, opposite } = this.result;
+    let found = detected.map((at) => ({ at, placed: false }));
+    for (const edit of this.edits) {
+      const [, kind, id, number, name, x, y] = POINT.exec(edit) ?? [];
+      if (Number(id) !== track || Number(number) !== frame) continue;
+      const k = keypoints.indexOf(name);
+      if (kind === "mirror") found = found.map((_, i) => found[opposite[i]]);
+      else if (kind === "accept") found = found.map(({ at, placed }) => ({ at, placed: placed || at !== null }));
+      else if (k >= 0) found[k] = { at: kind === "place" ? [Number(x), Number(y)] : null, placed: true };
+    }
+    return found;
+  }
+
+  /** Says where a keypoint is, or hides it outside the picture. @param {number} track @param {number} k @param {[number, number]} at */
+  place(track, k, [x, y]) {
+    const [width, height] = this.result.size_px, inside = x >= 0 && y >= 0 && x <= width && y <= height;
+    const start = `${track}@${this.page.state().frame} ${this.result.keypoints[k]}`;
+    return this.point(inside ? `place ${start} ${x.toFixed(1)},${y.toFixed(1)}` : `hide ${start}`,
+      inside ? "" : "The keypoint is outside the picture, so it is hidden.");
+  }
+
+  /** @param {number} track @param {number} k */
+  hide(track, k) {
+    return this.point(`hide ${track}@${this.page.state().frame} ${this.result.keypoints[k]}`);
+  }
+
+  /** Says something about all keypoints of a bird. @param {"mirror" | "accept"} kind */
+  all(kind) {
+    const { frame, selected } = this.page.state();
+    if (selected.length !== 1) return this.say("Choose one bird by a click.", true);
+    return this.point(`${kind} ${selected[0]}@${frame}`);
+  }
+
+  /** Stores an edit of keypoints; it replaces the last edit of the same keypoint. @param {string} edit @param {string} text */
+  async point(edit, text = "") {
+    const target = (/** @type {string | undefined} */ each) => POINT.exec(each ?? "")?.slice(2, 5).join();
+    const again = POINT.exec(edit)?.[4] && target(edit) === target(this.edits.at(-1));
+    await this.store([...(again ? this.edits.slice(0, -1) : this.edits), edit]);
+    if (text) this.say(text);
+  }
+
   async undo() {
     if (this.edits.length) await this.store(this.edits.slice(0, -1));
   }
@@ -59,12 +115,13 @@ export class Corrections {
   async store(edits) {
     try {
       const answer = await change("edits", { edits, known: this.edits });
-      this.edits = answer.edits ?? edits;
+      this.edits = answer.edits;
       this.say(answer.problem ?? "", Boolean(answer.problem));
     } catch (error) {
       this.say(String(/** @type {Error} */ (error).message), true);
     }
     this.show();
+    this.page.changed();
   }
 
   mark() {
@@ -115,8 +172,9 @@ export class Corrections {
       ? `Range: frames ${range[0] ?? "…"} to ${range[1] ?? "…"}` : "Range: press [ and ], escape removes it.";
     find("marked").textContent = this.marks.length ? `Frames ${this.marks.join(", ")}` : "None is marked.";
     find("edits").replaceChildren(...this.edits.map((edit) => {
-      const item = document.createElement("li");
+      const item = document.createElement("li"), [, track, frame] = /(\d+)[^@]*@(\d+)/.exec(edit) ?? [];
       item.textContent = edit;
+      if (frame) item.onclick = () => this.page.show(Number(frame), Number(track));
       return item;
     }));
   }

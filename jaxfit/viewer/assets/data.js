@@ -13,6 +13,7 @@
  * @property {number} frames_of_part
  * @property {[number, number][]} skeleton
  * @property {string[]} keypoints
+ * @property {number[]} opposite position of the same keypoint on the other side
  * @property {string[]} flags
  * @property {string[]} flag_colours
  * @property {ValueName[]} values
@@ -20,7 +21,7 @@
  * @property {boolean} detected
  */
 /** @typedef {{source: string | null, times_s: number[] | null, pictures: boolean}} FilmFacts */
-/** @typedef {{results: ResultFacts[], film: FilmFacts | null, corrections: {edits: string[], file: string} | null, notes?: string[]}} Facts */
+/** @typedef {{results: ResultFacts[], film: FilmFacts | null, corrections: {edits: string[], file: string, labels: string} | null, notes?: string[]}} Facts */
 /** @typedef {{facts: any, arrays: Record<string, any>, shapes: Record<string, number[]>}} Packed */
 
 /** @type {Record<string, any>} */
@@ -132,7 +133,7 @@ export async function filmAddress(source) {
   return URL.createObjectURL(new Blob([decoded(await savedText("film"))], { type: kind }));
 }
 
-/** Sends a change to the server; an answer with a `problem` has the `edits` that others have written. @param {string} action @param {object} sent @returns {Promise<any>} */
+/** Sends a change to the server; `edits` of the answer are those of the file, with a `problem` if others have written them. @param {string} action @param {object} sent @returns {Promise<any>} */
 export async function change(action, sent) {
   const answer = await fetch(`change/${action}`, { method: "POST", body: JSON.stringify(sent) });
   if (answer.status === 409) return answer.json();

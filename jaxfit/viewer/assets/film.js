@@ -11,6 +11,8 @@ const CACHE_BYTES = 250e6;
 const MARGIN_S = 1e-3;
 /** Longest wait for the picture of a film at rest, milliseconds. */
 const SHOWN_MS = 200;
+/** Largest distance of the pointer from a keypoint, pixels of the page. */
+const NEAR_PX = 11;
 
 /** Position of the last frame that begins before a time. @param {number[]} times @param {number} time @param {number} margin */
 export function positionAt(times, time, margin = MARGIN_S) {
@@ -144,6 +146,15 @@ export class FilmView {
     this.home = { x: facts.size_px[0] / 2, y: facts.size_px[1] / 2, width: facts.size_px[0], height: facts.size_px[1] };
     /** The track of which `home` has the size. */
     this.followed = -1;
+    /** Keypoints of the followed bird as they are drawn, with corrections. @type {{at: [number, number] | null, fitted: [number, number], placed: boolean}[]} */
+    this.points = [];
+    /** The keypoint under the pointer, −1 for none. */
+    this.hovered = -1;
+    /** A keypoint that is dragged. @type {{k: number, at: [number, number]} | null} */
+    this.moving = null;
+    /** What corrections make of detected keypoints, and what a dragged keypoint does; null without corrections.
+     * @type {{corrected: (track: number, detected: ([number, number] | null)[]) => {at: [number, number] | null, placed: boolean}[], place: (track: number, k: number, at: [number, number]) => void} | null} */
+    this.corrections = null;
     /** How far the view was dragged, pixels of the film. */
     this.offset = [0, 0];
     this.watch(select);
@@ -152,24 +163,30 @@ export class FilmView {
   /** @param {(track: number, more: boolean) => void} select */
   watch(select) {
     const { canvas } = this;
-    /** @type {{x: number, y: number, moved: boolean} | null} */
+    /** @type {{x: number, y: number, moved: boolean, k: number} | null} */
     let drag = null;
     canvas.addEventListener("pointerdown", (event) => {
-      drag = { x: event.clientX, y: event.clientY, moved: false };
+      drag = { x: event.clientX, y: event.clientY, moved: false, k: this.corrections ? this.pointAt(event) : -1 };
       canvas.setPointerCapture(event.pointerId);
     });
     canvas.addEventListener("pointermove", (event) => {
-      if (!drag) return;
+      if (!drag) return this.hover(this.pointAt(event));
       const { scale, ratio } = this.placement();
       drag.moved ||= Math.hypot(event.clientX - drag.x, event.clientY - drag.y) > 4;
       if (!drag.moved) return;
+      if (drag.k >= 0) {
+        this.moving = { k: drag.k, at: this.inFilm(event) };
+        return this.redraw();
+      }
       this.offset = [this.offset[0] - ((event.clientX - drag.x) * ratio) / scale, this.offset[1] - ((event.clientY - drag.y) * ratio) / scale];
-      drag = { x: event.clientX, y: event.clientY, moved: true };
+      drag = { x: event.clientX, y: event.clientY, moved: true, k: -1 };
       this.redraw();
     });
     canvas.addEventListener("pointerup", (event) => {
-      const n = drag && !drag.moved ? this.birdAt(event) : -1;
+      const n = drag && !drag.moved && drag.k < 0 ? this.birdAt(event) : -1;
       drag = null;
+      if (this.moving) this.corrections?.place(this.facts.tracks[this.followed].id, this.moving.k, this.moving.at);
+      this.moving = null;
       if (n >= 0) select(this.facts.tracks[n].id, event.shiftKey);
     });
     canvas.addEventListener("wheel", (event) => {
@@ -188,6 +205,25 @@ export class FilmView {
     });
   }
 
+  /** @param {number} k */
+  hover(k) {
+    if (k === this.hovered) return;
+    this.hovered = k;
+    this.canvas.style.cursor = k >= 0 && this.corrections ? "grab" : "";
+    this.redraw();
+  }
+
+  /** The keypoint of the followed bird under the pointer, −1 for none; fitted ones count where nothing is detected. @param {MouseEvent} event */
+  pointAt(event) {
+    const [x, y] = this.inFilm(event), { scale, ratio } = this.placement();
+    let best = -1, least = (NEAR_PX * ratio) / scale;
+    this.points.forEach(({ at, fitted }, k) => {
+      const [px, py] = at ?? fitted, far = Math.hypot(px - x, py - y) + (at ? 0 : 1e-6);
+      if (far < least) [best, least] = [k, far];
+    });
+    return best;
+  }
+
   /** Scale and offset from film pixels to canvas pixels, and canvas pixels per pixel of the page. */
   placement() {
     const { home, canvas } = this;
@@ -197,7 +233,7 @@ export class FilmView {
     return { scale, ratio, x: canvas.width / 2 - (home.x + this.offset[0]) * scale, y: canvas.height / 2 - (home.y + this.offset[1]) * scale };
   }
 
-  /** The point of the film under the pointer. @param {MouseEvent} event */
+  /** The point of the film under the pointer. @param {MouseEvent} event @returns {[number, number]} */
   inFilm(event) {
     const box = this.canvas.getBoundingClientRect(), { scale, ratio, x, y } = this.placement();
     return [((event.clientX - box.left) * ratio - x) / scale, ((event.clientY - box.top) * ratio - y) / scale];
@@ -242,6 +278,7 @@ export class FilmView {
     context.setTransform(scale, 0, 0, scale, x, y);
     this.outlines = t < 0 ? null : outlines;
     this.t = t;
+    this.points = [];
     if (t < 0) return;
     if (outlines) this.drawOutlines(context, outlines, t, selected, scale / ratio);
     if (!poses) return;
@@ -284,30 +321,33 @@ export class FilmView {
     context.lineWidth = 1 / scale;
     context.strokeStyle = "#ffffff90";
     for (const [a, b] of this.facts.skeleton) line(context, at(keypoints, a), at(keypoints, b));
-    for (let k = 0; k < K; k++) {
-      if (detected && detected[2 * (first + k)] !== MISSING) {
-        context.strokeStyle = "#ffe14d";
-        context.lineWidth = 1.5 / scale;
-        line(context, at(detected, k), at(keypoints, k));
-        circle(context, at(detected, k), 5 / scale);
+    const found = Array.from({ length: K }, (_, k) => (detected && detected[2 * (first + k)] !== MISSING ? at(detected, k) : null));
+    const points = (this.corrections?.corrected(this.facts.tracks[n].id, found) ?? found.map((each) => ({ at: each, placed: false })))
+      .map((point, k) => ({ ...point, fitted: at(keypoints, k) }));
+    if (this.moving && n === this.followed) Object.assign(points[this.moving.k], { at: this.moving.at, placed: true });
+    points.forEach(({ at: seen, fitted, placed }, k) => {
+      const marked = this.marked?.k === k;
+      if (seen) {
+        context.strokeStyle = marked ? "#ff4040" : placed ? "#2ee6ff" : "#ffe14d";
+        context.lineWidth = (marked ? 3 : placed ? 2.5 : 1.5) / scale;
+        line(context, seen, fitted);
+        circle(context, seen, (marked ? 7 : 5) / scale);
         context.stroke();
       }
-      circle(context, at(keypoints, k), 3 / scale);
-      context.fillStyle = "#fff";
+      circle(context, fitted, 3 / scale);
+      context.fillStyle = seen || !placed ? "#fff" : "#8889";
       context.strokeStyle = "#000a";
       context.lineWidth = 1 / scale;
       context.fill();
       context.stroke();
-    }
-    if (this.marked && detected) {
-      const { k, text } = this.marked, [x, y] = at(detected, k);
-      context.strokeStyle = "#ff4040";
-      context.lineWidth = 3 / scale;
-      line(context, [x, y], at(keypoints, k));
-      circle(context, [x, y], 7 / scale);
-      context.stroke();
-      write(context, text, x + 12 / scale, y, scale, "#ff7b7b", "left");
-    }
+    });
+    if (n !== this.followed) return;
+    this.points = points;
+    const named = this.hovered >= 0 ? this.hovered : this.marked?.k ?? -1;
+    if (named < 0) return;
+    const [x, y] = points[named].at ?? points[named].fitted;
+    const text = this.marked?.k === named ? this.marked.text : this.facts.keypoints[named].replaceAll("_", " ");
+    write(context, text, x + 12 / scale, y, scale, this.marked?.k === named ? "#ff8f8f" : "#fff", "left");
   }
 
   /** @param {CanvasRenderingContext2D} context @param {Packed} poses @param {number} first @param {string} colour @param {number} scale */

@@ -353,6 +353,9 @@ const CORRECTING = [
   [["j"], "Join two chosen birds", () => state.corrections?.add("join")],
   [["Delete"], "Delete the chosen birds", () => state.corrections?.add("delete")],
   [["e"], "Exclude the chosen bird in the range", () => state.corrections?.add("exclude")],
+  [["h"], "Hide the keypoint under the pointer, or show it where it is fitted", () => hideOrShow()],
+  [["x"], "Exchange left and right of the chosen bird in this frame", () => state.corrections?.all("mirror")],
+  [["a"], "Accept all keypoints of the chosen bird in this frame as labels", () => state.corrections?.all("accept")],
   [["Control+z", "u"], "Undo the last correction", () => state.corrections?.undo()],
   [["r"], "Refit", () => find("refit").click()],
   [["m"], "Mark the frame for labelling", () => state.corrections?.mark()],
@@ -397,6 +400,14 @@ function watchControls(correcting) {
   window.addEventListener("resize", redraw);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   window.addEventListener("hashchange", () => { if (readAddress()) refresh(); });
+}
+
+function hideOrShow() {
+  const { corrections, hovered, points, facts, followed } = state.columns[0].films[0] ?? {};
+  if (!corrections || hovered < 0 || !points[hovered]) return state.corrections?.say("Point at a keypoint first.", true);
+  const track = facts.tracks[followed].id;
+  if (points[hovered].at) state.corrections?.hide(track, hovered);
+  else state.corrections?.place(track, hovered, points[hovered].fitted);
 }
 
 /** Chooses a neighbour of the chosen bird in the timeline. @param {number} by */
@@ -464,7 +475,7 @@ async function addColumns(facts) {
 function drawLegend(facts) {
   const meanings = ["the pose agrees with the detections", "the detections do not determine the pose", "the detections contradict the pose"];
   const entries = facts.flags.map((flag, i) => /** @type {[string, string, string]} */ (["swatch", facts.flag_colours[i], `${flag}: ${meanings[i]}`]));
-  entries.push(["dot", "", "fitted keypoint"], ...(facts.detected ? [/** @type {[string, string, string]} */ (["dot ring", "", "detected keypoint, joined to the fitted one"])] : []));
+  entries.push(["dot", "", "fitted keypoint"], ...(facts.detected ? [/** @type {[string, string, string]} */ (["dot ring", "", "detected keypoint, joined to the fitted one"])] : []), ["dot ring placed", "", "keypoint that you have placed"]);
   find("legend").append(...entries.map(([name, colour, text]) => {
     const entry = document.createElement("span"), key = document.createElement("i");
     key.className = name;
@@ -490,7 +501,9 @@ async function open() {
   const first = facts.results[0];
   state.timeline = new Timeline(find("rows"), first.tracks, frames, first.flag_colours, { seek: go, select });
   if (facts.corrections) {
-    state.corrections = new Corrections(facts.corrections, {
+    state.corrections = new Corrections(facts.corrections, first, {
+      changed: () => refresh(),
+      show: (frame, track) => { select(track, false); go(nearest(frame)); },
       state: () => ({ frame: state.frames[state.i], selected: [...state.selected], range: state.range }),
       marked: () => showNumbers(),
       refitted: async () => { await addColumns(await readFacts()); refresh(); },
@@ -502,6 +515,8 @@ async function open() {
   find("notes").textContent = (facts.notes ?? []).concat(film ? [] : ["The film is not given: --video shows it."]).join(" ");
   document.querySelector("main")?.after(splitter());
   await addColumns(facts);
+  const close = state.columns[0].films[0];
+  if (close) close.corrections = state.corrections;
   readAddress();
   if (!location.hash.includes("birds=")) state.selected = new Set([first.tracks[0].id]);
   watchControls(facts.corrections !== null);
