@@ -80,6 +80,10 @@ class Viewer:
         times_s = film_times(self.video, frames_of(self.results)) if source else None
         return {"source": source, "times_s": times_s, "pictures": True}
 
+    def show_refit(self, folder: Path) -> None:
+        """Show the result of a refit, in place of an earlier one, beside the result."""
+        self.results[1:] = [self.open_result(folder)]
+
     def facts(self) -> dict[str, Any]:
         """Return what the page needs first."""
         corrections = None
@@ -145,7 +149,10 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
             return JSONResponse({"edits": list(map(str, session.edits))})
         if action == "refit":
             known = _list_of(sent, "known", str)
-            work = session.refit(lambda out: viewer.results.append(viewer.open_result(out)), known)
+            work = session.refit(viewer.show_refit, known)
+        elif action == "close":
+            del viewer.results[1:]
+            return JSONResponse({})
         elif action == "mark":
             work = session.mark(_list_of(sent, "frames", int))
         else:

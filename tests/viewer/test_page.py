@@ -18,6 +18,7 @@ from support.viewed import served, shown, unpacked, write_result
 import jaxfit
 from jaxfit.cli.view import leading_page
 from jaxfit.config.yaml_file import config_to_yaml
+from jaxfit.data.flags import FLAGS, flags
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.learning.networks.labels import read_labels
@@ -403,6 +404,10 @@ def drag(opened, start, end):
         opened.page.mouse.up() if move else opened.page.mouse.down()
 
 
+def rows_of_table(page, rows):
+    return [[cell.inner_text() for cell in row.locator("td").all()] for row in page.locator(rows).all()]
+
+
 @pytest.fixture(scope="module")
 def wrong(tmp_path_factory):
     """A fit of toy birds: the bill of bird 4 is detected 12 px beside its place in frames 102 to 106."""
@@ -442,8 +447,26 @@ def test_a_dragged_keypoint_is_a_label_and_the_refit_is_better(browser, wrong, t
         before, after = error_px(folder), error_px(viewer.results[1].folder)
         assert before > 2
         assert after < 0.5
+        opened.until("document.querySelector('#why h2')?.textContent.includes('→')")
+        bill_row = "#why table:last-child tr:has(td:text-is('bill tip')) td"
+        opened.until(
+            "[...document.querySelectorAll('#why table:last-child td')].some((td) => td.textContent === 'bill tip')"
+        )
+        shown_px = [float(text) for text in opened.page.locator(bill_row).all_inner_texts()[1:3]]
+        assert shown_px[1] == pytest.approx(after, abs=0.15)
+        assert shown_px[0] > 5  # the wrong detection against the pose before
+        counts = rows_of_table(opened.page, "#changes tr")
+        for result, column in ((folder, 1), (viewer.results[1].folder, 2)):
+            solution = load_solution(result)[0]
+            found = flags(np.asarray(solution.flags.doubts))[solution.valid]
+            assert {row[0]: int(row[column]) for row in counts[1:]} == {flag: (found == flag).sum() for flag in FLAGS}
+        assert opened.page.evaluate("jaxfit.state.timeline.after.flags.length") == 3 * 17
+        refit = viewer.results[1].folder
+        opened.page.keyboard.press("Control+z")
+        opened.until("jaxfit.state.columns.length === 1 && jaxfit.state.timeline.after === null")
+        assert len(viewer.results) == len(read_edits(edits)) == 1
         opened.close()
-        shutil.rmtree(viewer.results[1].folder)
+        shutil.rmtree(refit)
     labels = viewer.session.labels_path
     few = read_few_labels(labels, video, corrected.BIRD.keypoint_names)
     assert (few.frame_index.tolist(), few.confidence.sum()) == ([104], 1)

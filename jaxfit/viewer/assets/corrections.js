@@ -11,7 +11,7 @@ export class Corrections {
   /**
    * @param {{edits: string[], file: string, labels: string}} facts
    * @param {import("viewer/data").ResultFacts} result
-   * @param {{state: () => {frame: number, selected: number[], range: [number | null, number | null]}, changed: () => void,
+   * @param {{state: () => {frame: number, selected: number[], range: [number | null, number | null]}, changed: () => void, closed: () => Promise<boolean>,
    *   show: (frame: number, track: number) => void, marked: (frames: number[]) => void, refitted: () => void}} page
    */
   constructor(facts, result, page) {
@@ -107,7 +107,9 @@ export class Corrections {
     if (text) this.say(text);
   }
 
+  /** Closes the refit, or else removes the last edit. */
   async undo() {
+    if (await this.page.closed()) return this.say("The refit is closed; its folder stays.");
     if (this.edits.length) await this.store(this.edits.slice(0, -1));
   }
 

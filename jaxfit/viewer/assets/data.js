@@ -126,6 +126,11 @@ export function arrays(result, name) {
   return found;
 }
 
+/** Forgets the arrays of a result whose number another result gets. @param {number} result */
+export function forget(result) {
+  for (const path of packed.keys()) if (path.startsWith(`results/${result}/`)) packed.delete(path);
+}
+
 /** The film of a saved page as an address. @param {string} source @returns {Promise<string>} */
 export async function filmAddress(source) {
   if (!isSaved || !document.querySelector('script[data-path="film"]')) return source;

@@ -326,7 +326,7 @@ export class FilmView {
       .map((point, k) => ({ ...point, fitted: at(keypoints, k) }));
     if (this.moving && n === this.followed) Object.assign(points[this.moving.k], { at: this.moving.at, placed: true });
     points.forEach(({ at: seen, fitted, placed }, k) => {
-      const marked = this.marked?.k === k;
+      const marked = this.marked?.k === k && !placed;
       if (seen) {
         context.strokeStyle = marked ? "#ff4040" : placed ? "#2ee6ff" : "#ffe14d";
         context.lineWidth = (marked ? 3 : placed ? 2.5 : 1.5) / scale;
@@ -346,8 +346,9 @@ export class FilmView {
     const named = this.hovered >= 0 ? this.hovered : this.marked?.k ?? -1;
     if (named < 0) return;
     const [x, y] = points[named].at ?? points[named].fitted;
-    const text = this.marked?.k === named ? this.marked.text : this.facts.keypoints[named].replaceAll("_", " ");
-    write(context, text, x + 12 / scale, y, scale, this.marked?.k === named ? "#ff8f8f" : "#fff", "left");
+    const marked = this.marked?.k === named && !points[named].placed;
+    const text = marked ? this.marked?.text ?? "" : this.facts.keypoints[named].replaceAll("_", " ");
+    write(context, text, x + 12 / scale, y, scale, marked ? "#ff8f8f" : "#fff", "left");
   }
 
   /** @param {CanvasRenderingContext2D} context @param {Packed} poses @param {number} first @param {string} colour @param {number} scale */

@@ -1,6 +1,6 @@
 // The page: its state, its controls, and the clock that film, birds and timeline share.
 // @ts-check
-import { arrays, isSaved, readFacts } from "viewer/data";
+import { arrays, change, forget, isSaved, readFacts } from "viewer/data";
 import { Corrections } from "viewer/corrections";
 import { Film, FilmView, positionAt } from "viewer/film";
 import { LedgeView } from "viewer/ledge";
@@ -179,35 +179,52 @@ function showNumbers() {
 /** The pose whose reasons the page shows. */
 let explained = "";
 
-/** Shows why the pose of the chosen bird has its flag, and marks its worst keypoint. */
+/** Address of the reasons of a track's pose in the present frame; empty without a pose. @param {Column | undefined} column @param {number | undefined} track */
+function reasonsOf(column, track) {
+  const n = column?.facts.tracks.findIndex(({ id }) => id === track) ?? -1, t = column?.positions.get(state.frames[state.i]) ?? -1;
+  return column && n >= 0 && t >= 0 ? `why/${n * column.facts.frames.length + t}` : "";
+}
+
+/** Shows why the pose of the chosen bird has its flag, beside the pose of a refit, and marks its worst keypoint. */
 async function showWhy() {
-  const column = state.columns[0], n = column.facts.tracks.findIndex((track) => state.selected.has(track.id));
-  const t = column.positions.get(state.frames[state.i]) ?? -1, pose = n < 0 || t < 0 ? "" : `why/${n * column.facts.frames.length + t}`;
+  const track = [...state.selected][0], [column, refit] = state.columns, pose = reasonsOf(column, track), why = find("why");
   if (isSaved || state.playing || pose === explained) return;
   explained = pose;
   mark(null);
-  if (!pose) return find("why").replaceChildren();
-  await new Promise((done) => setTimeout(done, WHY_MS));
-  if (pose !== explained) return; // the reader goes on
-  const { facts } = await arrays(0, pose), why = find("why"), title = document.createElement("h2");
+  why.classList.add("stale");
+  await new Promise((done) => setTimeout(done, WHY_MS)); // the reader may go on
   if (pose !== explained) return;
-  const flag = document.createElement("b");
-  flag.className = "flag";
-  flag.textContent = facts.flag;
-  flag.style.background = column.facts.flag_colours[column.facts.flags.indexOf(facts.flag)] ?? "";
-  title.append(`Bird ${column.facts.tracks[n].id}: `, flag);
-  const doubts = document.createElement("ul");
+  why.hidden = !pose;
+  if (!pose) return;
+  const again = state.corrections ? reasonsOf(refit, track) : "";
+  const [{ facts }, after] = await Promise.all([arrays(0, pose), again ? arrays(1, again) : null]);
+  if (pose !== explained) return;
+  const title = document.createElement("h2"), doubts = document.createElement("ul");
+  title.append(`Bird ${track}: `, flagOf(column, facts.flag), ...(after ? [" → ", flagOf(column, after.facts.flag)] : []));
   doubts.append(...facts.doubts.map((/** @type {string} */ doubt) => Object.assign(document.createElement("li"), { textContent: doubt })));
-  const measures = table(["", "here", "usual"], facts.measures.map((/** @type {any} */ each) => [each.title, each.here, each.usual]));
+  /** @type {any[]} */
+  const keypoints = facts.keypoints.slice(0, WORST);
+  const head = after ? ["before", "refit"] : ["here"];
+  const refitted = (/** @type {any[]} */ rows, /** @type {string} */ by, /** @type {any} */ each) => rows.find((row) => row[by] === each[by]);
+  const measures = table(["", ...head, "usual"], facts.measures.map((/** @type {any} */ each) => [
+    each.title, each.here, ...(after ? [refitted(after.facts.measures, "title", each)?.here ?? ""] : []), each.usual]));
   facts.measures.forEach((/** @type {any} */ each, /** @type {number} */ row) => measures.rows[row + 1].classList.toggle("problem", each.bad));
-  const worst = table(["Keypoint off by", "px", "usual", "conf."], facts.keypoints.slice(0, WORST).map((/** @type {any} */ each) => [each.name, each.px.toFixed(1), each.usual_px?.toFixed(1) ?? "", each.confidence.toFixed(2)]));
-  facts.keypoints.slice(0, WORST).forEach((/** @type {any} */ each, /** @type {number} */ row) => {
+  const worst = table(["Keypoints off by px", ...head, "usual", ...(after ? [] : ["conf."])], keypoints.map((each) => [each.name, each.px.toFixed(1),
+    ...(after ? [refitted(after.facts.keypoints, "k", each)?.px.toFixed(1) ?? ""] : []), each.usual_px?.toFixed(1) ?? "", ...(after ? [] : [each.confidence.toFixed(2)])]));
+  keypoints.forEach((each, row) => {
     worst.rows[row + 1].onmouseenter = () => mark(each);
-    worst.rows[row + 1].onmouseleave = () => mark(facts.keypoints[0]);
+    worst.rows[row + 1].onmouseleave = () => mark(keypoints[0]);
   });
   why.replaceChildren(title, doubts, measures, worst);
-  why.hidden = false;
-  mark(facts.keypoints[0] ?? null);
+  why.classList.remove("stale");
+  mark(keypoints[0] ?? null);
+}
+
+/** @param {Column} column @param {string} text */
+function flagOf(column, text) {
+  const flag = Object.assign(document.createElement("b"), { className: "flag", textContent: text });
+  flag.style.background = column.facts.flag_colours[column.facts.flags.indexOf(text)] ?? "";
+  return flag;
 }
 
 /** Draws one keypoint of the chosen bird in red. @param {{k: number, name: string, px: number} | null} keypoint */
@@ -304,8 +321,9 @@ async function showValue() {
   timeline.values = null;
   timeline.drawStill(state.selected);
   try {
-    const { arrays: found } = await arrays(0, `values/${name}`);
-    timeline.values = spread(found.values, state.columns[0], NaN, Float32Array);
+    const [found, after] = await Promise.all([0, ...(timeline.after ? [1] : [])].map((c) => arrays(c, `values/${name}`)));
+    timeline.values = spread(found.arrays.values, state.columns[0], NaN, Float32Array);
+    if (timeline.after && after) timeline.after.values = spread(after.arrays.values, state.columns[1], NaN, Float32Array);
     timeline.title = "";
   } catch (error) {
     find("notes").textContent = String(/** @type {Error} */ (error).message);
@@ -313,18 +331,56 @@ async function showValue() {
   timeline.drawStill(state.selected);
 }
 
+/** Shows flags and values of the refit beside those of the result, and how many flags have changed. */
+async function showRefit() {
+  const timeline = /** @type {Timeline} */ (state.timeline), column = state.columns[1];
+  timeline.after = null;
+  find("changes").replaceChildren();
+  if (column && state.corrections) {
+    timeline.after = { flags: spread((await arrays(1, "flags")).arrays.flags, column, 0, Uint8Array), values: null };
+    const count = (/** @type {Uint8Array} */ flags) => flags.reduce((sums, flag) => { sums[flag]++; return sums; }, [0, 0, 0, 0]);
+    const before = count(timeline.flags), after = count(timeline.after.flags);
+    find("changes").append(table(["poses", "before", "refit"], column.facts.flags.map((flag, i) => [flag, `${before[i + 1]}`, `${after[i + 1]}`])));
+  }
+  explained = "";
+  await showValue();
+  refresh();
+}
+
+/** Closes the refit; whether there was one. */
+async function closeRefit() {
+  if (!state.corrections || state.columns.length < 2) return false;
+  await change("close", {});
+  removeColumns();
+  await showRefit();
+  return true;
+}
+
+/** Removes the views of the refit. */
+function removeColumns() {
+  for (const column of state.columns.splice(1)) {
+    column.section.previousElementSibling?.remove(); // the splitter
+    column.section.remove();
+    column.ledge.renderer?.dispose();
+    forget(column.number);
+  }
+  find("results").classList.remove("several");
+}
+
 /**
- * Values of a result at all frames of the page.
+ * Values of a result at all frames of the page, in the rows of the first result.
  * @template {Float32Array | Uint8Array} A
  * @param {A} values @param {Column} column @param {number} empty @param {new (size: number) => A} Type @returns {A}
  */
 function spread(values, column, empty, Type) {
-  const T = column.facts.frames.length, all = state.frames.length;
-  const found = new Type(column.facts.tracks.length * all).fill(empty);
-  state.frames.forEach((frame, i) => {
-    const t = column.positions.get(frame);
-    if (t === undefined) return;
-    for (let n = 0; n < column.facts.tracks.length; n++) found[n * all + i] = values[n * T + t];
+  const T = column.facts.frames.length, all = state.frames.length, rows = state.columns[0].facts.tracks;
+  const found = new Type(rows.length * all).fill(empty);
+  rows.forEach(({ id }, row) => {
+    const n = column.facts.tracks.findIndex((track) => track.id === id);
+    state.frames.forEach((frame, i) => {
+      const t = column.positions.get(frame);
+      if (n >= 0 && t !== undefined) found[row * all + i] = values[n * T + t];
+    });
   });
   return /** @type {A} */ (found);
 }
@@ -506,7 +562,8 @@ async function open() {
       show: (frame, track) => { select(track, false); go(nearest(frame)); },
       state: () => ({ frame: state.frames[state.i], selected: [...state.selected], range: state.range }),
       marked: () => showNumbers(),
-      refitted: async () => { await addColumns(await readFacts()); refresh(); },
+      closed: closeRefit,
+      refitted: async () => { removeColumns(); await addColumns(await readFacts()); await showRefit(); },
     });
   }
   find("value").replaceChildren(...first.values.map((each) => new Option(each.unit ? `${each.title} (${each.unit})` : each.title, each.name)));
@@ -527,8 +584,7 @@ async function open() {
   state.timeline.flags = spread(flagged.arrays.flags, state.columns[0], 0, Uint8Array);
   state.timeline.drawStill(state.selected);
   document.body.dataset.ready = "yes";
-  await showValue();
-  showNumbers();
+  await showRefit();
 }
 
 // for tests and for colleagues who look behind the page

@@ -3,7 +3,7 @@
 
 /** @typedef {{id: number, colour: string}} Row */
 
-const ROW = 15, LABEL = 46, CURVE = 64;
+const ROW = 16, LABEL = 46, CURVE = 64;
 /** Share of the row that the flags ok, unsure and contradicted fill. */
 const FILLED = [0, 0.55, 0.8, 1];
 
@@ -28,6 +28,8 @@ export class Timeline {
     this.flags = new Uint8Array(rows.length * frames.length);
     /** @type {Float32Array | null} */
     this.values = null;
+    /** Flags and values of the refit, in the rows of the result. @type {{flags: Uint8Array, values: Float32Array | null} | null} */
+    this.after = null;
     this.title = "";
     this.ink = this.soft = this.chosen = this.band = "#888";
     this.height = CURVE + ROW * rows.length;
@@ -88,9 +90,11 @@ export class Timeline {
       context.fillRect(2, top + 3, 8, ROW - 6);
       context.fillStyle = this.ink;
       context.fillText(String(id), 14, top + ROW / 2 + 0.5, LABEL - 16);
-      this.drawFlags(context, n, top, width);
+      const half = (ROW - 4) / 2;
+      if (this.after) this.drawFlags(context, this.after.flags, n, top + ROW - 2, half, width);
+      this.drawFlags(context, this.flags, n, top + ROW - 2 - (this.after ? half : 0), this.after ? half - 1 : 2 * half, width);
     });
-    this.drawCurve(context, width, selected);
+    this.drawCurves(context, width, selected);
     if (this.range[0] !== null && this.range[1] !== null) {
       context.fillStyle = "#3366cc28";
       const left = this.x(this.range[0], width);
@@ -98,35 +102,50 @@ export class Timeline {
     }
   }
 
-  /** Each column shows the worst flag of its frames. @param {CanvasRenderingContext2D} context @param {number} n @param {number} top @param {number} width */
-  drawFlags(context, n, top, width) {
+  /**
+   * Each column shows the worst flag of its frames.
+   * @param {CanvasRenderingContext2D} context @param {Uint8Array} flags @param {number} n @param {number} bottom @param {number} height @param {number} width
+   */
+  drawFlags(context, flags, n, bottom, height, width) {
     const T = this.frames.length, columns = Math.max(1, Math.min(T, Math.floor(width - LABEL)));
     for (let c = 0; c < columns; c++) {
       const from = Math.floor((c * T) / columns), to = Math.max(Math.floor(((c + 1) * T) / columns), from + 1);
       let worst = 0;
-      for (let t = from; t < to; t++) worst = Math.max(worst, this.flags[n * T + t]);
+      for (let t = from; t < to; t++) worst = Math.max(worst, flags[n * T + t]);
       if (!worst) continue;
-      const left = LABEL + ((width - LABEL) * c) / columns, high = (ROW - 4) * FILLED[worst];
+      const left = LABEL + ((width - LABEL) * c) / columns, high = height * FILLED[worst];
       context.fillStyle = this.colours[worst];
-      context.fillRect(left, top + ROW - 2 - high, (width - LABEL) / columns + 0.5, high);
+      context.fillRect(left, bottom - high, (width - LABEL) / columns + 0.5, high);
     }
   }
 
-  /** @param {CanvasRenderingContext2D} context @param {number} width @param {Set<number>} selected */
-  drawCurve(context, width, selected) {
-    const values = this.values, T = this.frames.length;
-    if (!values) return;
+  /** Draws the values of the result, dashed beside those of a refit. @param {CanvasRenderingContext2D} context @param {number} width @param {Set<number>} selected */
+  drawCurves(context, width, selected) {
+    const shown = [this.values, this.after?.values].filter((each) => each instanceof Float32Array);
+    context.fillStyle = this.soft;
+    context.fillText(this.title, LABEL + 4, 8);
     let low = Infinity, high = -Infinity;
-    for (const value of values) if (Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
+    for (const values of shown) for (const value of values) if (Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
     if (low > high) return;
     if (low === high) { low -= 0.5; high += 0.5; }
     const y = (/** @type {number} */ value) => CURVE - 5 - ((CURVE - 20) * (value - low)) / (high - low);
+    shown.forEach((values, i) => this.drawCurve(context, values, i < shown.length - 1, y, width, selected));
+    context.setLineDash([]);
+    context.textAlign = "right";
+    context.fillText(short(high), LABEL - 4, y(high));
+    context.fillText(short(low), LABEL - 4, y(low) - 3);
+    context.textAlign = "left";
+  }
+
+  /** @param {CanvasRenderingContext2D} context @param {Float32Array} values @param {boolean} before @param {(value: number) => number} y @param {number} width @param {Set<number>} selected */
+  drawCurve(context, values, before, y, width, selected) {
+    const T = this.frames.length, step = Math.max(1, Math.floor(T / (4 * width)));
+    context.setLineDash(before ? [3, 3] : []);
     const order = this.rows.map((_, n) => n).sort((a, b) => Number(selected.has(this.rows[a].id)) - Number(selected.has(this.rows[b].id)));
-    const step = Math.max(1, Math.floor(T / (4 * width)));
     for (const n of order) {
       const chosen = selected.has(this.rows[n].id);
       context.strokeStyle = chosen || !selected.size ? this.rows[n].colour : `${this.rows[n].colour}66`;
-      context.lineWidth = chosen ? 2 : 1;
+      context.lineWidth = chosen && !before ? 2 : 1;
       context.beginPath();
       let open = false;
       for (let t = 0; t < T; t += step) {
@@ -137,12 +156,6 @@ export class Timeline {
       }
       context.stroke();
     }
-    context.fillStyle = this.soft;
-    context.fillText(this.title, LABEL + 4, 8);
-    context.textAlign = "right";
-    context.fillText(short(high), LABEL - 4, y(high));
-    context.fillText(short(low), LABEL - 4, y(low) - 3);
-    context.textAlign = "left";
   }
 
   /** @param {number} i position of the present frame @param {number[]} marks positions of frames marked for labelling */
