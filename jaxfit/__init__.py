@@ -41,7 +41,7 @@ Models
     find_bird               a model by its name or its file
 
 Settings
-    load_config             a `FitConfig`: `paper`, `balanced`, `map`, … or a YAML file
+    load_config             a `FitConfig`: `paper`, `map`, … or a YAML file
     load_reconstruct_config a `ReconstructConfig`, which contains a `TrackConfig`
     with_values             a config with other values
 

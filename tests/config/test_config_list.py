@@ -38,7 +38,6 @@ def test_every_config_says_what_it_is_for():
     assert published == {"paper", "baseline", "aves"}
     assert {name for name, group in groups.items() if group == GROUPS[1]} == {
         "fast",
-        "balanced",
         "few_labels",
         "map",
         "photo",

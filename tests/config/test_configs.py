@@ -39,13 +39,11 @@ def test_the_paper_and_its_baseline():
     assert dataclasses.replace(baseline, window=100, common_size=True, filter_window=5) == PAPER
 
 
-def test_balanced_and_map():
-    fast, balanced, config = (load_config(name) for name in ("fast", "balanced", "map"))
-    assert (balanced.unknown_pixels, balanced.edge) == (True, "unbiased")
+def test_fast_and_map():
+    fast, config = (load_config(name) for name in ("fast", "map"))
+    assert (config.unknown_pixels, config.edge, config.overlap) == (True, "unbiased", 20)
     assert (fast.unknown_pixels, fast.edge) == (False, "soft_rasterizer")  # the paper's objective
-    settings, stage = fast.stage_settings(fast.stages[0]), balanced.stages[0]
-    changed = {"pose_prior": settings["pose_prior"] | {"weight": 30}, "velocity": settings["velocity"] | {"weight": 50}}
-    assert balanced.stage_settings(stage) == settings | changed
+    assert fast.stage_settings(fast.stages[1]) == PAPER.stage_settings(PAPER.stages[1])
     # with the scale of the last stage in the first stage, wingbeats would be rounded off from the start
     scales = [config.stage_settings(stage)["motion_likelihood"]["sd_rad_s2"] for stage in config.stages]
     assert scales == [62.5, 6.25, 6.25, 6.25]
@@ -60,7 +58,8 @@ def test_round_trip(tmp_path, name):
 
 def test_reconstruct_holds_no_defaults_and_reads_back(tmp_path):
     config = load_reconstruct_config()
-    assert (config.track, config.overlay, config.fit) == (TrackConfig(), OverlayConfig(), load_config("balanced"))
+    fit = dataclasses.replace(load_config("map"), filter_window=5, error_bars=False)
+    assert (config.track, config.overlay, config.fit) == (TrackConfig(), OverlayConfig(), fit)
     text = documented_yaml(config)
     assert load_reconstruct_config(written(tmp_path, text)) == config
     lines = [line.strip() for line in text.splitlines()]
@@ -117,7 +116,7 @@ def test_which_file_a_base_is(tmp_path, monkeypatch):
     [
         ("fit: baseline", "baseline", {}),
         ("fit: {base: baseline, window: 3}", "baseline", {"window": 3}),
-        ("base: reconstruct\nfit: {window: 3}", "balanced", {"window": 3}),
+        ("base: reconstruct\nfit: {window: 3}", "map", {"window": 3, "filter_window": 5, "error_bars": False}),
         ("base: reconstruct\nfit: beside.yaml", "baseline", {"window": 4}),
         ("base: middle.yaml\nfit: {common_size: true}", "baseline", {"window": 4, "common_size": True}),
     ],
@@ -241,7 +240,7 @@ def test_errors_in_the_file_of_the_fit_name_that_file(tmp_path):
 def test_configs_of_the_wrong_kind():
     with pytest.raises(InputError, match=r"paper: is the config of a fit.*fit: paper"):
         load_reconstruct_config("paper")
-    with pytest.raises(InputError, match=r"reconstruct: line 4: `fit` is not a known key"):
+    with pytest.raises(InputError, match=r"reconstruct: line 6: `fit` is not a known key"):
         load_config("reconstruct")
 
 

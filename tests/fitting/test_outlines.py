@@ -113,7 +113,7 @@ def test_a_fit_needs_no_keypoint():
         keypoint_names=BIRD.keypoint_names,
         masks={(0, t): encode_mask(mask > 0) for t, mask in enumerate(masks)},
     )
-    config = load_config("balanced")
+    config = load_config("fast")
     stage = dataclasses.replace(config.stages[1], steps=8)
     crop = dataclasses.replace(config.crop, size_px=64)
     changes = {"stages": (stage,), "min_keypoints": 0, "window": T, "overlap": 0, "crop": crop, "initialise": SEARCH}
