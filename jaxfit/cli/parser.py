@@ -113,12 +113,16 @@ def _view(command: Parser) -> None:
     command.shared("--camera", "--observations", "--frames", "--fps")
     text = "file of the corrections, which `jaxfit tracks --edits` takes too (default: RESULT.edits beside the result)"
     command.add_argument("--edits", type=Path, metavar="FILE", help=text)
-    command.add_argument("--port", type=int, metavar="PORT", help="port to listen on (default: a free port)")
-    command.add_argument("--no-browser", action="store_true", help="print the address, and open no browser")
+    _add_server(command)
     text = "write a page that opens without jaxfit: one file of up to 30 MB (.html), or a folder"
     command.add_argument("--save", type=Path, metavar="PAGE.html|DIR", help=text)
     command.add_argument("--overwrite", action="store_true", help="replace an earlier page of --save")
     command.shared("--force")
+
+
+def _add_server(command: Parser) -> None:
+    command.add_argument("--port", type=int, metavar="PORT", help="port to listen on (default: a free port)")
+    command.add_argument("--no-browser", action="store_true", help="print the address, and open no browser")
 
 
 @_command("start", "describe", "behaviour.describe")
@@ -150,6 +154,20 @@ def _suggest(command: Parser) -> None:
     command.add_argument("--teacher", metavar="NAME", help=text)
     command.add_argument("--empty", action="store_true", help="write no labels, for footage with low trust")
     add_out(command, "DIR", "folder for the pictures and labels", overwrite="earlier suggestions in the folder")
+
+
+@_command("correct", "label", "view.label")
+def _label(command: Parser) -> None:
+    """Label keypoints of birds in some frames of a film, in the browser, for reconstruct --labels and train."""
+    command.add_argument("video", type=Path, metavar="VIDEO", help="a video, or a folder of frames")
+    command.add_argument("--count", type=int, default=10, help="number of frames (default %(default)s)")
+    command.add_argument(
+        "--birds", type=int, default=5, help="largest number of birds in a frame (default %(default)s)"
+    )
+    command.shared("--model")
+    text = "COCO file of the labels, which the next start continues (default: VIDEO.labels.json beside the video)"
+    command.add_argument("--out", type=Path, metavar="FILE.json", help=text)
+    _add_server(command)
 
 
 @_command("correct", "train", "training.train")

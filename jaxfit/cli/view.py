@@ -1,4 +1,4 @@
-"""`view`: film, birds and timeline in a page of the browser."""
+"""`view`, `label`: film, birds and timeline in a page of the browser."""
 
 from __future__ import annotations
 
@@ -8,12 +8,18 @@ import sys
 import tempfile
 import webbrowser
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from jaxfit.cli.results import frame_range
 from jaxfit.cli.tables import show
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.progress import terminal
+
+if TYPE_CHECKING:
+    from jaxfit.viewer.server import Viewer
 
 
 def view(options: argparse.Namespace) -> None:
@@ -50,7 +56,7 @@ def view(options: argparse.Namespace) -> None:
         show(f"{saved.path} ({saved.bytes / 1e6:.2f} MB): open it in a browser")
         return
     require_extra("view", "jaxfit view", "starlette", "uvicorn")
-    from jaxfit.viewer.server import Viewer, listening, serve
+    from jaxfit.viewer.server import Viewer
     from jaxfit.viewer.session import Session
 
     session = None
@@ -59,17 +65,49 @@ def view(options: argparse.Namespace) -> None:
         session = Session(options.results[0], edits, options.observations, video)
     elif options.edits is not None:
         raise InputError("--edits", "corrects one result, and several are given", "give one result")
+    _serve(Viewer(results, video, session, opened), options, options.results[0].resolve().parent)
+
+
+def label(options: argparse.Namespace) -> None:
+    """Serve the page of a film without a result until Ctrl+C."""
+    require_extra("view", "jaxfit label", "starlette", "uvicorn")
+    from jaxfit.model.files import find_bird
+    from jaxfit.review.edits import read_edits
+    from jaxfit.review.points import Point
+    from jaxfit.review.suggest import varied_frames
+    from jaxfit.viewer.blank import Blank, LabelSession, labels_edits
+    from jaxfit.viewer.server import Viewer
+
+    for name in ("count", "birds"):
+        if getattr(options, name) < 1:
+            raise InputError(f"--{name}", f"is {getattr(options, name)}", "give 1 or more")
+    out = options.out or options.video.resolve().with_name(f"{options.video.resolve().stem}.labels.json")
+    edits = labels_edits(out)
+    if out.exists() and not edits.exists():
+        raise InputError(out, "exists and was not written by `jaxfit label`", "give another --out")
+    points = [edit for edit in (read_edits(edits) if edits.exists() else []) if isinstance(edit, Point)]
+    frames = np.union1d(varied_frames(options.video, options.count, terminal), [point.frame for point in points])
+    birds = max([options.birds, *(point.track for point in points)])
+    blank = Blank(options.video, find_bird(options.model), frames.astype(int), birds)
+    show(f"labels → {out}")
+    _serve(Viewer([blank], options.video, LabelSession(blank, out)), options, out.resolve().parent)
+
+
+def _serve(viewer: Viewer, options: argparse.Namespace, folder: Path) -> None:
+    """Serve a page, and open it in the browser; `folder` gets the page that leads there."""
+    from jaxfit.viewer.server import listening, serve
+
     sock, leading = listening(options.port), []
 
     def started(address: str) -> None:
         show(f"{address}")
         show("open this address in a browser of this computer; Ctrl+C ends the viewer")
         if has_display() and not options.no_browser:
-            leading.append(leading_page(address, options.results[0].resolve().parent))
+            leading.append(leading_page(address, folder))
             webbrowser.open(leading[0].as_uri())
 
     try:
-        serve(Viewer(results, video, session, opened), sock, started)
+        serve(viewer, sock, started)
     finally:
         for page in leading:
             page.unlink(missing_ok=True)

@@ -357,6 +357,37 @@ def _choose(
     return frames, at[picks].tolist()
 
 
+def varied_frames(video: Path, count: int, progress: ProgressTask = silent) -> np.ndarray:
+    """Return the numbers of frames that look different and are spread over a video, in increasing order.
+
+    Args:
+        video: a video, or a folder of frames. Some of its frames are read.
+        count: number of frames.
+        progress: reports every frame that is read.
+
+    Raises:
+        InputError: the video cannot be read, or has fewer frames.
+    """
+    total = probe_video(video).frames
+    if total is None:
+        total = sum(1 for _ in read_frames(video))
+    _check_count(count, total, video)
+    candidates, numbers, thumbnails = (
+        np.linspace(0, total - 1, min(total, SHORTLIST * count)).round().astype(int),
+        [],
+        [],
+    )
+    with progress("Choosing frames", len(candidates)) as report_progress:
+        for number in candidates.tolist():
+            for frame in read_frames(video, number, number + 1):
+                numbers.append(number)
+                thumbnails.append(thumbnail(frame.picture))
+            report_progress(1, f"frame {number}")
+    _check_count(count, len(numbers), video)
+    picks = choose(np.full(len(numbers), 0.5), np.array(thumbnails), np.array(numbers), count)
+    return np.sort(np.array(numbers)[picks])
+
+
 def suggest_marked(
     video: Path, out: Path, frames: Sequence[int], result: Path, progress: ProgressTask = silent
 ) -> Suggestions:

@@ -7,7 +7,7 @@ import logging
 import secrets
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +24,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import parse_json
+from jaxfit.viewer.blank import Blank
 from jaxfit.viewer.film import film_times, frame_picture, is_played
 from jaxfit.viewer.page import FILES, index, policy
 from jaxfit.viewer.session import EditsChangedError, Session
@@ -40,10 +41,10 @@ LARGEST_BODY = 1 << 20
 class Viewer:
     """What one page shows: results of one film, and the corrections of the first result."""
 
-    results: list[Shown]
+    results: Sequence[Shown | Blank]
     video: Path | None
     session: Session | None
-    open_result: Callable[[Path], Shown]
+    open_result: Callable[[Path], Shown] | None = None
     """Opens the new result after corrections."""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
 
@@ -82,7 +83,8 @@ class Viewer:
 
     def show_refit(self, folder: Path) -> None:
         """Show the result of a refit, in place of an earlier one, beside the result."""
-        self.results[1:] = [self.open_result(folder)]
+        assert self.open_result is not None
+        self.results = [self.results[0], self.open_result(folder)]
 
     def facts(self) -> dict[str, Any]:
         """Return what the page needs first."""
@@ -151,7 +153,7 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
             known = _list_of(sent, "known", str)
             work = session.refit(viewer.show_refit, known)
         elif action == "close":
-            del viewer.results[1:]
+            viewer.results = viewer.results[:1]
             return JSONResponse({})
         elif action == "mark":
             work = session.mark(_list_of(sent, "frames", int))
@@ -251,14 +253,14 @@ _HEADERS = [
 ]
 
 
-def _content(result: Shown, kind: str, argument: str | None) -> bytes:
+def _content(result: Shown | Blank, kind: str, argument: str | None) -> bytes:
     """Return arrays of a result: `rig`, `flags`, `poses/3`, `outlines/3`, `why/120`, `values/speed`."""
     if kind in ("rig", "flags") and argument is None:
         return result.rig() if kind == "rig" else result.flags()
     numbered = {"poses": result.part, "outlines": result.outlines, "why": result.why}
     if kind in numbered and argument is not None:
         return numbered[kind](_number(argument))
-    if kind == "values" and argument in [each["name"] for each in result.kinds_of_values]:
+    if isinstance(result, Shown) and kind == "values" and argument in [each["name"] for each in result.kinds_of_values]:
         return result.values(argument)
     raise HTTPException(404)
 

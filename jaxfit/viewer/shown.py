@@ -27,6 +27,7 @@ from jaxfit.export.glb import four_weights
 from jaxfit.export.result import Exported
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import skeleton_pairs
+from jaxfit.model.bird import Bird
 from jaxfit.view.birds import REGION_95, Detected, DrawnBird, outlines
 from jaxfit.view.colours import FLAG_COLOURS, css, track_colour
 from jaxfit.viewer.arrays import in_steps, pack
@@ -68,7 +69,7 @@ class Shown:
         self.solution, self._lens = as_filmed(folder, exported.solution, exported.bird, camera)
         self.observations = exported.observations if observations is None else observations
         self._detected = Detected(self.solution, self.observations)
-        self.times_s = exported.times_s
+        self.times_s, self.frame_index = exported.times_s, self.solution.frame_index
         self._lock = Lock()
         self.part = lru_cache(PARTS_KEPT)(self._part)
         self.outlines = lru_cache(PARTS_KEPT)(self._outlines)
@@ -161,17 +162,6 @@ class Shown:
     def rig(self) -> bytes:
         """Return the mesh, its skeleton and its skin, and the place of camera and ledge."""
         bird, flock = self.bird, self.flock
-        joints, weights = four_weights(bird)
-        rest = np.asarray(bird.joints, np.float32)
-        arrays = {
-            "vertices": np.asarray(bird.vertices, np.float32),
-            "faces": np.asarray(bird.faces, np.uint32),
-            "colours": np.asarray(bird.vertex_colours, np.float32),
-            "joints": rest,
-            "skin_joints": joints.astype(np.uint16),
-            "skin_weights": weights.astype(np.float32),
-            "shapes": np.asarray(bird.shape_basis, np.float32),
-        }
         places = flock.place[self.solution.valid]
         facts = {
             "parents": [int(each) for each in bird.parents],
@@ -184,7 +174,7 @@ class Shown:
             "high": np.quantile(places, 0.99, axis=0).tolist(),
             "camera": self._camera(),
         }
-        return pack(arrays, facts)
+        return pack(mesh_arrays(bird), facts)
 
     def _camera(self) -> dict[str, Any]:
         """Return the place of the camera in the world: every pose is known in both."""
@@ -303,9 +293,23 @@ class Shown:
         return np.where(s.valid, values, np.nan)
 
 
-def frames_of(results: Sequence[Shown]) -> Int[np.ndarray, "T"]:
+def mesh_arrays(bird: Bird) -> dict[str, np.ndarray]:
+    """Return the mesh of a bird, its skeleton and its skin, as the page reads them."""
+    joints, weights = four_weights(bird)
+    return {
+        "vertices": np.asarray(bird.vertices, np.float32),
+        "faces": np.asarray(bird.faces, np.uint32),
+        "colours": np.asarray(bird.vertex_colours, np.float32),
+        "joints": np.asarray(bird.joints, np.float32),
+        "skin_joints": joints.astype(np.uint16),
+        "skin_weights": weights.astype(np.float32),
+        "shapes": np.asarray(bird.shape_basis, np.float32),
+    }
+
+
+def frames_of(results: Sequence[Any]) -> Int[np.ndarray, "T"]:
     """Return the frames of the page: those of all results."""
-    return np.unique(np.concatenate([each.solution.frame_index for each in results]))
+    return np.unique(np.concatenate([each.frame_index for each in results]))
 
 
 def regions(covariance: Float[np.ndarray, "N F K 2 2"]) -> Int16[np.ndarray, "N F K 3"]:

@@ -78,9 +78,9 @@ class Client:
 
 
 @contextmanager
-def served(folder, video, edits=None, results=None):
+def served(folder, video, edits=None, results=None, session=None):
     """Serve the page of a result in a thread; yields the client and the viewer."""
-    session = None if edits is None else Session(folder, edits, None, video)
+    session = session if edits is None else Session(folder, edits, None, video)
     viewer = Viewer(results or [shown(folder)], video, session, shown)
     sock = listening(None)
     port = sock.getsockname()[1]

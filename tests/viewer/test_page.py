@@ -24,8 +24,10 @@ from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.learning.networks.labels import read_labels
 from jaxfit.perception.label_flow import read_few_labels
 from jaxfit.review.edits import read_edits
+from jaxfit.review.suggest import varied_frames
 from jaxfit.video.reader import read_frames
 from jaxfit.viewer import session
+from jaxfit.viewer.blank import Blank, LabelSession
 from jaxfit.viewer.page import ASSETS
 from jaxfit.viewer.saved import save_page
 
@@ -504,6 +506,40 @@ def test_keypoints_by_keys_and_outside_the_picture(browser, wrong, tmp_path):
         second.value.wait_for_selector("#state:has-text('second page')")
         second.value.close()
         opened.close()
+
+
+def test_birds_are_labelled_in_a_film_without_a_result(browser, tmp_path):
+    video = films.encode(tmp_path / "numbered.mp4", count=30)
+    blank = Blank(video, corrected.BIRD, varied_frames(video, 3), birds=2)
+    session = LabelSession(blank, tmp_path / "labels.json")
+    with served(None, video, results=[blank], session=session) as (client, _):
+        opened = Opened(browser, client.address)
+        opened.until("jaxfit.state.columns[0].ledge.ready && jaxfit.state.columns[0].films[0].points.length === 12")
+        frame = int(blank.frame_index[1])
+        opened.go(1)
+        opened.page.keyboard.press("ArrowDown")
+        placed = {"bill_tip": (40, 20), "left_eye": (50.5, 30), "crown": (60, 24)}
+        for i, (name, at) in enumerate(placed.items()):
+            assert name.replace("_", " ") in opened.page.inner_text("#why p")
+            opened.page.mouse.click(*opened.page.evaluate(IN_CLOSE, list(at)))
+            opened.until(f"document.querySelectorAll('#edits li').length === {i + 1} && !jaxfit.state.busy")
+            if name == "left_eye":
+                opened.page.keyboard.press("n")  # the right eye cannot be seen
+                opened.until("document.querySelector('#why p').textContent.includes('crown')")
+        balls = "jaxfit.state.columns[0].ledge.balls.map((ball) => ball.scale.x)"
+        opened.until(f"{balls}.indexOf(2) === 4")  # the nape is next
+        assert opened.page.evaluate("[...jaxfit.state.timeline.flags]") == [0, 0, 0, 0, 1, 0]
+        opened.close()
+    labels = read_few_labels(session.labels_path, video, corrected.BIRD.keypoint_names)
+    assert (labels.frame_index.tolist(), labels.present.sum()) == ([frame], 1)
+    known = {corrected.BIRD.keypoint_names[k]: labels.keypoints_px[0, 0, k] for k in np.flatnonzero(labels.confidence)}
+    assert known.keys() == placed.keys()
+    for name, at in placed.items():
+        assert known[name] == pytest.approx(at, abs=0.3)
+    with served(None, video, results=[blank], session=LabelSession(blank, session.labels_path)) as (client, _):
+        again = Opened(browser, client.address, f"#frame={frame}&birds=2")
+        again.until("jaxfit.state.columns[0].films[0].points.filter(({ at }) => at).length === 3")
+        again.close()
 
 
 def test_saved_pages_need_no_server_and_no_network(browser, result, tmp_path):

@@ -10,11 +10,13 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 import pytest
+from support import films
 from support.cli_files import rejected
 from support.viewed import served, unpacked, write_result
 
 from jaxfit.cli import view
 from jaxfit.cli.main import main
+from jaxfit.data.formats.coco import read_coco
 from jaxfit.foundation.errors import InputError
 from jaxfit.review.edits import read_edits
 from jaxfit.viewer import server, session
@@ -349,6 +351,32 @@ def test_wrong_use_is_one_sentence(tmp_path, capsys):
     (tmp_path / "wrong.edits").write_text("explode 4\n")
     rejected(capsys, ["view", str(result), "--edits", str(tmp_path / "wrong.edits")], "wrong.edits", "line 1")
     rejected(capsys, ["view", str(result), "--port", "99999999"], "--port")
+
+
+def test_wrong_use_of_labelling_is_one_sentence(tmp_path, capsys):
+    video = films.encode(tmp_path / "film.mp4", count=4)
+    rejected(capsys, ["label", str(video), "--count", "5"], "has 4 frames", "give --count 4")
+    rejected(capsys, ["label", str(video), "--birds", "0"], "--birds", "give 1 or more")
+    rejected(capsys, ["label", str(tmp_path / "no.mp4")], "no.mp4")
+    (tmp_path / "film.labels.json").write_text("{}")
+    rejected(capsys, ["label", str(video), "--count", "2"], "film.labels.json", "was not written by", "another --out")
+
+
+def test_labels_of_a_film_are_kept_when_labelling_goes_on(tmp_path, monkeypatch):
+    """A second start with fewer frames and birds shows all frames and birds that have labels."""
+    video, served = films.encode(tmp_path / "film.mp4", count=8), []
+    (tmp_path / "film.labels.edits").write_text("place 4@5 bill_tip 10,12\n")
+    monkeypatch.setattr("jaxfit.viewer.server.serve", lambda viewer, *_: served.append(viewer))
+    assert main(["label", str(video), "--count", "1", "--birds", "1", "--no-browser"]) == 0
+    (viewer,) = served
+    assert 5 in viewer.results[0].frame_index
+    assert len(viewer.results[0].facts()["tracks"]) == 4
+    assert viewer.facts()["corrections"]["edits"] == ["place 4@5 bill_tip 10,12"]
+    edits = ["place 4@5 bill_tip 10,12", "place 4@5 crown 30,20"]
+    viewer.session.set_edits(edits, edits[:1])
+    labels = read_coco(tmp_path / "film.labels.json")
+    assert (labels.track_id.tolist(), labels.frame_index.tolist()) == ([4], [5])
+    assert labels.box_px[0, 0].tolist() == [10, 12, 20, 8]
 
 
 def test_the_browser_gets_a_private_page_and_not_the_address(tmp_path, monkeypatch, capsys):

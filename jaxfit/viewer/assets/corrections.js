@@ -22,6 +22,8 @@ export class Corrections {
     this.marks = [];
     find("corrections").hidden = false;
     find("file").textContent = `Saved in ${facts.file}; placed keypoints are also labels in ${facts.labels}.`;
+    /** Places the next keypoint of a bird without a result. @type {((track: number, at: [number, number]) => void) | null} */
+    this.label = null;
     this.others = new BroadcastChannel(location.pathname);
     this.others.onmessage = ({ data }) => {
       if (data === "open?") this.others.postMessage("open");

@@ -19,6 +19,7 @@
  * @property {ValueName[]} values
  * @property {number} region_radius radius of a region of 95 %, in standard deviations
  * @property {boolean} detected
+ * @property {boolean} [labelling] whether the frames have no result, and are labelled
  */
 /** @typedef {{source: string | null, times_s: number[] | null, pictures: boolean}} FilmFacts */
 /** @typedef {{results: ResultFacts[], film: FilmFacts | null, corrections: {edits: string[], file: string, labels: string} | null, notes?: string[]}} Facts */

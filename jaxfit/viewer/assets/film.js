@@ -146,14 +146,14 @@ export class FilmView {
     this.home = { x: facts.size_px[0] / 2, y: facts.size_px[1] / 2, width: facts.size_px[0], height: facts.size_px[1] };
     /** The track of which `home` has the size. */
     this.followed = -1;
-    /** Keypoints of the followed bird as they are drawn, with corrections. @type {{at: [number, number] | null, fitted: [number, number], placed: boolean}[]} */
+    /** Keypoints of the followed bird as they are drawn, with corrections. @type {{at: [number, number] | null, fitted: [number, number] | null, placed: boolean}[]} */
     this.points = [];
     /** The keypoint under the pointer, −1 for none. */
     this.hovered = -1;
     /** A keypoint that is dragged. @type {{k: number, at: [number, number]} | null} */
     this.moving = null;
     /** What corrections make of detected keypoints, and what a dragged keypoint does; null without corrections.
-     * @type {{corrected: (track: number, detected: ([number, number] | null)[]) => {at: [number, number] | null, placed: boolean}[], place: (track: number, k: number, at: [number, number]) => void} | null} */
+     * @type {{corrected: (track: number, detected: ([number, number] | null)[]) => {at: [number, number] | null, placed: boolean}[], place: (track: number, k: number, at: [number, number]) => void, label: ((track: number, at: [number, number]) => void) | null} | null} */
     this.corrections = null;
     /** How far the view was dragged, pixels of the film. */
     this.offset = [0, 0];
@@ -183,8 +183,9 @@ export class FilmView {
       this.redraw();
     });
     canvas.addEventListener("pointerup", (event) => {
-      const n = drag && !drag.moved && drag.k < 0 ? this.birdAt(event) : -1;
+      const clicked = drag && !drag.moved && drag.k < 0, n = clicked ? this.birdAt(event) : -1;
       drag = null;
+      if (clicked && this.corrections?.label) this.corrections.label(this.facts.tracks[this.followed].id, this.inFilm(event));
       if (this.moving) this.corrections?.place(this.facts.tracks[this.followed].id, this.moving.k, this.moving.at);
       this.moving = null;
       if (n >= 0) select(this.facts.tracks[n].id, event.shiftKey);
@@ -218,7 +219,9 @@ export class FilmView {
     const [x, y] = this.inFilm(event), { scale, ratio } = this.placement();
     let best = -1, least = (NEAR_PX * ratio) / scale;
     this.points.forEach(({ at, fitted }, k) => {
-      const [px, py] = at ?? fitted, far = Math.hypot(px - x, py - y) + (at ? 0 : 1e-6);
+      const shown = at ?? fitted;
+      if (!shown) return;
+      const [px, py] = shown, far = Math.hypot(px - x, py - y) + (at ? 0 : 1e-6);
       if (far < least) [best, least] = [k, far];
     });
     return best;
@@ -242,6 +245,7 @@ export class FilmView {
   /** Shows the chosen bird in the middle. Its size stays until another bird is chosen. @param {Packed} poses @param {number} t @param {Set<number>} selected */
   follow(poses, t, selected) {
     const n = this.facts.tracks.findIndex((track) => selected.has(track.id));
+    if (n >= 0 && this.corrections?.label) this.followed = n;
     if (n < 0 || !poses.arrays.valid[n * poses.shapes.valid[1] + t]) return;
     const box = boxOf(poses, n, t);
     [this.home.x, this.home.y] = [box.x, box.y];
@@ -283,7 +287,7 @@ export class FilmView {
     if (outlines) this.drawOutlines(context, outlines, t, selected, scale / ratio);
     if (!poses) return;
     this.facts.tracks.forEach((track, n) => {
-      if (!poses.arrays.valid[n * poses.shapes.valid[1] + t]) return;
+      if (!poses.arrays.valid[n * poses.shapes.valid[1] + t] && !this.corrections?.label) return;
       if (points && this.follows && selected.has(track.id)) this.drawPoints(context, poses, n, t, scale / ratio);
       else if (!this.follows && this.facts.tracks.length > 1) drawNumber(context, track, boxOf(poses, n, t), scale / ratio);
     });
@@ -314,26 +318,30 @@ export class FilmView {
 
   /** Draws the keypoints of a bird: fitted ones as dots, detected ones as rings that lines join to the dots. @param {CanvasRenderingContext2D} context @param {Packed} poses @param {number} n @param {number} t @param {number} scale pixels of the page per pixel of the film */
   drawPoints(context, poses, n, t, scale) {
-    const { keypoints, detected, regions } = poses.arrays, step = poses.facts.step_px;
+    const { keypoints, detected, regions, valid } = poses.arrays, step = poses.facts.step_px;
     const [, F, K] = poses.shapes.keypoints, first = (n * F + t) * K, { colour } = this.facts.tracks[n];
     const at = (/** @type {any} */ array, /** @type {number} */ k) => pair(array, first + k, step);
     if (regions) this.drawRegions(context, poses, first, colour, scale);
-    context.lineWidth = 1 / scale;
-    context.strokeStyle = "#ffffff90";
-    for (const [a, b] of this.facts.skeleton) line(context, at(keypoints, a), at(keypoints, b));
     const found = Array.from({ length: K }, (_, k) => (detected && detected[2 * (first + k)] !== MISSING ? at(detected, k) : null));
     const points = (this.corrections?.corrected(this.facts.tracks[n].id, found) ?? found.map((each) => ({ at: each, placed: false })))
-      .map((point, k) => ({ ...point, fitted: at(keypoints, k) }));
+      .map((point, k) => ({ ...point, fitted: valid[n * F + t] ? at(keypoints, k) : null }));
+    context.lineWidth = 1 / scale;
+    context.strokeStyle = "#ffffff90";
+    for (const pair of this.facts.skeleton) {
+      const [a, b] = pair.map((k) => points[k].fitted ?? points[k].at);
+      if (a && b) line(context, a, b);
+    }
     if (this.moving && n === this.followed) Object.assign(points[this.moving.k], { at: this.moving.at, placed: true });
     points.forEach(({ at: seen, fitted, placed }, k) => {
       const marked = this.marked?.k === k && !placed;
       if (seen) {
         context.strokeStyle = marked ? "#ff4040" : placed ? "#2ee6ff" : "#ffe14d";
         context.lineWidth = (marked ? 3 : placed ? 2.5 : 1.5) / scale;
-        line(context, seen, fitted);
+        if (fitted) line(context, seen, fitted);
         circle(context, seen, (marked ? 7 : 5) / scale);
         context.stroke();
       }
+      if (!fitted) return;
       circle(context, fitted, 3 / scale);
       context.fillStyle = seen || !placed ? "#fff" : "#8889";
       context.strokeStyle = "#000a";
@@ -345,7 +353,7 @@ export class FilmView {
     this.points = points;
     const named = this.hovered >= 0 ? this.hovered : this.marked?.k ?? -1;
     if (named < 0) return;
-    const [x, y] = points[named].at ?? points[named].fitted;
+    const [x, y] = points[named].at ?? points[named].fitted ?? [-1e6, 0];
     const marked = this.marked?.k === named && !points[named].placed;
     const text = marked ? this.marked?.text ?? "" : this.facts.keypoints[named].replaceAll("_", " ");
     write(context, text, x + 12 / scale, y, scale, marked ? "#ff8f8f" : "#fff", "left");

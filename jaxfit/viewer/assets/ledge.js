@@ -33,6 +33,8 @@ export class LedgeView {
     this.followed = -1;
     this.shapeOf = new Map();
     this.showAll = () => {};
+    /** The keypoints of the model. @type {THREE.Mesh<THREE.SphereGeometry, THREE.MeshBasicMaterial>[] | null} */
+    this.balls = null;
   }
 
   /** Builds the scene. @param {Packed} rig */
@@ -51,7 +53,8 @@ export class LedgeView {
     sun.position.set(1, -2, 4);
     this.scene.add(sun);
     this.openCameras();
-    if (rig.facts.level) this.addLedge();
+    if (rig.facts.keypoints) this.addKeypoints(rig.facts.keypoints);
+    else if (rig.facts.level) this.addLedge();
     this.facts.tracks.forEach((track) => this.addBird(track.colour));
     this.watchClicks(this.renderer.domElement);
     this.message.textContent = rig.facts.notes.join("; ");
@@ -84,6 +87,32 @@ export class LedgeView {
     };
     this.showAll();
     controls.addEventListener("change", () => this.render());
+  }
+
+  /** Shows where the keypoints of the model are. @param {[number, number, number][]} places */
+  addKeypoints(places) {
+    const ball = new THREE.SphereGeometry(0.016 * this.rig?.facts.length);
+    this.balls = places.map((place) => {
+      const made = new THREE.Mesh(ball, new THREE.MeshBasicMaterial({ depthTest: false }));
+      made.position.set(...place);
+      made.renderOrder = 1;
+      this.scene.add(made);
+      return made;
+    });
+  }
+
+  /** Shows the model in its rest pose, with one keypoint in red. @param {number} marked */
+  poseModel(marked) {
+    if (!this.ready || !this.rig) return;
+    const J = this.rig.facts.parents.length, turns = Array.from({ length: 4 * J }, (_, i) => (i % 4 === 3 ? 1 : 0));
+    const rest = { facts: { turn_step: 1 }, shapes: {}, arrays: { turns, place: [0, 0, 0], size: [1] } };
+    this.birds.forEach((bird, n) => { bird.visible = n === 0; });
+    this.poseBird(this.birds[0], 0, rest, 0);
+    this.balls?.forEach((ball, k) => {
+      ball.material.color.set(k === marked ? 0xff2020 : 0xffffff);
+      ball.scale.setScalar(k === marked ? 2 : 1);
+    });
+    this.followBird(new Set([this.facts.tracks[0].id]));
   }
 
   addLedge() {

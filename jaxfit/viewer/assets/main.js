@@ -104,12 +104,14 @@ const state = {
   /** @type {Timeline | null} */ timeline: null,
   /** @type {Corrections | null} */ corrections: null,
   /** @type {(number | null)[]} */ times: [],
+  /** the keypoint that the next click labels, −1 for the first that is not placed */ next: -1,
   busy: false,
   again: false,
 };
 
 /** @param {number} track @param {boolean} more whether further birds stay chosen */
 function select(track, more) {
+  state.next = -1;
   const was = state.selected.has(track);
   if (!more) state.selected.clear();
   if (was && more) state.selected.delete(track);
@@ -150,7 +152,8 @@ async function draw(seek) {
         film.draw(picture, t, poses, outlines, state.selected, find("points").checked);
         film.message.textContent = state.film?.problem ?? "";
       });
-      if (poses) column.ledge.pose(poses, t, state.selected);
+      if (column.facts.labelling) column.ledge.poseModel(nextKeypoint());
+      else if (poses) column.ledge.pose(poses, t, state.selected);
       else column.ledge.pose(/** @type {any} */ ({ shapes: { valid: [0, 0] } }), -1, state.selected);
       column.ledge.render();
     });
@@ -158,7 +161,32 @@ async function draw(seek) {
     find("notes").textContent = String(/** @type {Error} */ (error).message);
   }
   showNumbers();
-  showWhy();
+  if (state.columns[0].facts.labelling) showKeypoints();
+  else showWhy();
+}
+
+/** The keypoint that a click places on a film without a result: the chosen one, or the first that is not placed. */
+function nextKeypoint() {
+  const points = state.columns[0].films[0].points;
+  return state.next >= 0 ? state.next : points.findIndex(({ placed }) => !placed);
+}
+
+/** Lists the keypoints of a film without a result, and which of them the chosen bird has. */
+function showKeypoints() {
+  const { facts, films: [film] } = state.columns[0], next = nextKeypoint(), { flags } = /** @type {Timeline} */ (state.timeline);
+  const names = facts.keypoints.map((name) => name.replaceAll("_", " ")), why = find("why");
+  const list = table([`Bird ${[...state.selected][0] ?? "–"}`, ""], names.map((name, k) => [name, film.points[k]?.placed ? (film.points[k].at ? "✓" : "hidden") : ""]));
+  names.forEach((_, k) => {
+    list.rows[k + 1].classList.toggle("next", k === next);
+    list.rows[k + 1].onclick = () => { state.next = k; refresh(); };
+  });
+  const hint = document.createElement("p");
+  hint.textContent = next >= 0 ? `Click the ${names[next]} of the bird in the film. N goes on without it.` : "All keypoints are labelled. Go to the next frame or bird.";
+  why.replaceChildren(hint, list);
+  why.hidden = false;
+  const labelled = new Set((state.corrections?.edits ?? []).map((edit) => /^place (\d+@\d+)/.exec(edit)?.[1]));
+  facts.tracks.forEach(({ id }, n) => state.frames.forEach((frame, i) => { flags[n * state.frames.length + i] = labelled.has(`${id}@${frame}`) ? 1 : 0; }));
+  state.timeline?.drawStill(state.selected);
 }
 
 function showNumbers() {
@@ -247,13 +275,22 @@ function table(head, rows) {
 
 /** @param {number} i position of a frame */
 function go(i) {
+  state.next = -1;
   state.i = Math.min(Math.max(i, 0), state.frames.length - 1);
   if (state.playing) pause();
   return refresh();
 }
 
+/** Leaves out the keypoint that the next click would label. */
+function skipKeypoint() {
+  const points = state.columns[0].films[0].points, next = nextKeypoint();
+  state.next = points.findIndex(({ placed }, k) => k > next && !placed);
+  refresh();
+}
+
 /** Moves to the next or the previous moment at which a pose becomes unsure or contradicted. @param {number} by */
 function goToFlag(by) {
+  if (state.columns[0].facts.labelling) return by > 0 ? skipKeypoint() : undefined;
   const { flags, frames } = /** @type {Timeline} */ (state.timeline), T = frames.length;
   for (let i = state.i + by; i >= 0 && i < T; i += by) {
     for (let row = 0; row * T < flags.length; row++) {
@@ -461,9 +498,9 @@ function watchControls(correcting) {
 function hideOrShow() {
   const { corrections, hovered, points, facts, followed } = state.columns[0].films[0] ?? {};
   if (!corrections || hovered < 0 || !points[hovered]) return state.corrections?.say("Point at a keypoint first.", true);
-  const track = facts.tracks[followed].id;
-  if (points[hovered].at) state.corrections?.hide(track, hovered);
-  else state.corrections?.place(track, hovered, points[hovered].fitted);
+  const track = facts.tracks[followed].id, { at, fitted } = points[hovered];
+  if (at) state.corrections?.hide(track, hovered);
+  else if (fitted) state.corrections?.place(track, hovered, fitted);
 }
 
 /** Chooses a neighbour of the chosen bird in the timeline. @param {number} by */
@@ -574,6 +611,14 @@ async function open() {
   await addColumns(facts);
   const close = state.columns[0].films[0];
   if (close) close.corrections = state.corrections;
+  if (first.labelling && state.corrections) {
+    document.body.classList.add("label");
+    state.corrections.label = (track, at) => {
+      const k = nextKeypoint();
+      if (k >= 0) state.corrections?.place(track, k, at);
+      skipKeypoint();
+    };
+  }
   readAddress();
   if (!location.hash.includes("birds=")) state.selected = new Set([first.tracks[0].id]);
   watchControls(facts.corrections !== null);
