@@ -10,10 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from jaxfit.behaviour.result import shown_behaviour
 from jaxfit.config.build import plain_config, with_values
 from jaxfit.config.fit import FitConfig
-from jaxfit.config.perception import NONE, TrackConfig
+from jaxfit.config.perception import OUTLINE, TrackConfig
 from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
@@ -33,8 +35,8 @@ from jaxfit.foundation.unfinished import Parts, unfinished_folder, unfinished_wo
 from jaxfit.foundation.workers import Cluster
 from jaxfit.model.bird import Bird, model_hash
 from jaxfit.model.files import load_murre
-from jaxfit.perception.detections import check_segmenter, network_files, open_keypoint_detector
-from jaxfit.perception.keypoints import NoKeypoints
+from jaxfit.perception.detections import check_segmenter, keypoint_name, network_files, open_keypoint_detector
+from jaxfit.perception.keypoints import with_outline_keypoints
 from jaxfit.perception.label_flow import carry_labels, origin_counts, read_few_labels
 from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segmenter
@@ -132,7 +134,8 @@ class Networks(NamedTuple):
 
     segmenter: Segmenter | None
     """The segmenter of the caller; None for that of the config."""
-    keypoints: KeypointDetector
+    keypoints: KeypointDetector | None
+    """None for given tracks."""
     choice: SegmenterChoice | None
     """The segmenter that `auto` stands for."""
     hashes: dict[str, dict[str, str]]
@@ -187,6 +190,7 @@ def reconstruct(
     cluster: Cluster | None = None,
     labels: str | Path | None = None,
     masks: str | Path | None = None,
+    fit_of_others: FitConfig | None = None,
 ) -> Reconstruction:
     """Track the birds of a video, fit their poses and draw them on the video.
 
@@ -209,9 +213,10 @@ def reconstruct(
         progress: receives the progress of every part.
         cluster: worker processes that run the networks of `config` and fit the windows. None: this process.
         labels: keypoints of a few frames in any format of observations. Optical flow carries them to the other frames,
-            and no keypoint network runs. None: a network detects the keypoints.
+            and the network `outline` detects them where there is no flow. None: a network detects the keypoints.
         masks: a folder of pictures in which every grey value is one bird, or a file of observations: the tracks with
-            their masks, in place of tracking.
+            their masks, in place of tracking. Keypoints follow from the outlines.
+        fit_of_others: settings in place of `config.fit` for keypoints of labels or outlines, which may be of any bird.
 
     Returns:
         The result. A failed fit of one bird appears in the bird's status and does not affect other birds.
@@ -234,14 +239,18 @@ def reconstruct(
         model_of_fit(bird, config.fit)  # reports a setting that cannot be used before the tracking
         labelled = None if labels is None else read_few_labels(labels, video, bird.keypoint_names)
         if labelled is not None:
-            config = with_values(config, {"track.keypoints.file": NONE})
+            config = with_values(config, {"track.keypoints.file": OUTLINE})
         given = None if masks is None else given_tracks(masks, video)
         config, networks = _choose(config, video, bird, segmenter, keypoints, progress, given is not None)
+        if fit_of_others is not None and keypoint_name(config.track) == OUTLINE:
+            config = replace(config, fit=fit_of_others)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
             store = Store(unfinished, config, video, bird, networks, progress)
             tracking = given or _track(video, config.track, networks, bird, store, progress, cluster)
             tracking = tracking._replace(observations=_with_names(tracking.observations, networks.names, bird))
+            if given is not None:
+                tracking = tracking._replace(observations=with_outline_keypoints(tracking.observations))
         carried = None
         if labelled is not None:
             with clock("labels"):
@@ -261,7 +270,7 @@ def reconstruct(
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
             if carried is not None:
                 summary["labels"] = {"file": str(labels), "used": carried.used, "problems": carried.problems}
-            if config.track.keypoints.file == NONE:
+            if np.any(tracking.observations.keypoint_origin):
                 summary["pose_sources"] = origin_counts(tracking.observations)
             settings = config_to_yaml(config)
             write_coco(tracking.observations, part / OBSERVATIONS, tracking.info())
@@ -292,17 +301,17 @@ def _choose(
 ) -> tuple[ReconstructConfig, Networks]:
     """Return the config with a checked segmenter in place of `auto`, and the networks; none for given tracks."""
     if has_tracks:
-        config = with_values(config, {"track.keypoints.file": NONE})
-        return config, Networks(None, NoKeypoints(), None, {}, False, names_in_model((), bird.keypoint_names, ""))
+        config = with_values(config, {"track.keypoints.file": OUTLINE})
+        return config, Networks(None, None, None, {}, False, names_in_model((), bird.keypoint_names, ""))
     kinds = {"segmenter": segmenter, "keypoints": keypoints}
-    keypoints = keypoints or open_keypoint_detector(config.track)
     choice = None
     if segmenter is None:
         track_config, choice = with_chosen_segmenter(video, config.track, progress)
         check_segmenter(track_config)
         config = replace(config, track=track_config)
+    keypoints = keypoints or open_keypoint_detector(config.track)
     files = {kind: files for kind, files in network_files(config.track).items() if kinds[kind] is None}
-    names = names_in_model(keypoints.keypoint_names, bird.keypoint_names, config.track.keypoints.file)
+    names = names_in_model(keypoints.keypoint_names, bird.keypoint_names, keypoint_name(config.track))
     all_of_config = not any(kinds.values())
     return config, Networks(segmenter, keypoints, choice, file_hashes(files), all_of_config, names)
 

@@ -173,7 +173,9 @@ def _label(command: Parser) -> None:
 @_command("correct", "train", "training.train")
 def _train(command: Parser) -> None:
     """Train a network on labelled footage, or a built-in network again (needs the extra `train`)."""
-    command.add_argument("network", choices=("segmenter", "keypoints"), help="network to train")
+    command.add_argument("network", choices=("segmenter", "keypoints", "outline"), help="network to train")
+    text = "outline: also species of this model, two in three (default: murres only)"
+    command.add_argument("--model", metavar="MODEL", help=text)
     add_out(command, "N.onnx", "network file to write", overwrite="an existing file")
     text = f"labelled frames: {OBSERVATIONS}; for a segmenter also COCO masks without keypoints, or folders of masks"
     command.add_argument("--labels", type=Path, nargs="+", metavar="FILE", help=text)

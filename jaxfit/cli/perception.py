@@ -62,10 +62,7 @@ def track(options: argparse.Namespace) -> None:
 
 def reconstruct(options: argparse.Namespace) -> None:
     """Track the birds of a video, fit their poses and draw them."""
-    from dataclasses import replace
-
     from jaxfit.config.fit import load_config
-    from jaxfit.config.perception import NONE
     from jaxfit.data.result_folder import OBSERVATIONS, OVERLAY, POSES, SUMMARY
     from jaxfit.foundation.workers import open_cluster
     from jaxfit.pipeline import NoTrackError, reconstruct
@@ -74,9 +71,7 @@ def reconstruct(options: argparse.Namespace) -> None:
 
     start = time.perf_counter()
     config = reconstruct_config(options)
-    has_network = options.labels is None and options.masks is None and config.track.keypoints.file != NONE
-    if options.config == "reconstruct" and not has_network:
-        config = replace(config, fit=load_config("few_labels"))
+    fit_of_others = load_config("few_labels") if options.config == "reconstruct" else None
     bird = find_bird(options.model)
     with open_cluster(options.workers, options.scheduler) as cluster:
         try:
@@ -90,6 +85,7 @@ def reconstruct(options: argparse.Namespace) -> None:
                 cluster=cluster,
                 labels=options.labels,
                 masks=options.masks,
+                fit_of_others=fit_of_others,
             )
         except NoTrackError as error:
             _show_failure(error.tracking, config.track.min_track_frames)

@@ -54,6 +54,13 @@ def train(options: argparse.Namespace) -> None:
         raise InputError("--video", "is given with labels", "give the film of the labels by --images")
     if options.video and options.network != "segmenter":
         raise InputError("--video", "is given for keypoints", "a teacher makes masks: give labels by --labels")
+    if options.network == "outline":
+        if options.labels or options.base:
+            raise InputError("train outline", "takes no labels and no base", "it learns from simulated outlines only")
+        _train_outline(options)
+        return
+    if options.model:
+        raise InputError("--model", f"is given for {options.network}", "only `train outline` takes a model")
     if options.labels or options.video:
         _train_on_labels(options)
         return
@@ -78,6 +85,23 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
     losses = train_network(options.network, options.out, simulation, schedule, options.seed, terminal, options.base)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
     show(f"{options.network} trained in {(time.perf_counter() - start) / 60:.0f} min, loss {loss} → {options.out}")
+
+
+def _train_outline(options: argparse.Namespace) -> None:
+    from jaxfit.learning.networks.training import SCHEDULES, train_outline
+    from jaxfit.model.files import find_bird, load_murre
+
+    start, schedule = time.perf_counter(), SCHEDULES["outline"]
+    if options.steps is not None:
+        schedule = schedule._replace(steps=options.steps)
+    birds = [*([find_bird(options.model)] * 2 if options.model else []), load_murre()]
+    folder = options.frames or Path("training_frames")
+    species = {} if options.scenes is None else {"species": options.scenes}
+    losses = train_outline(
+        options.out, birds, folder, schedule=schedule, seed=options.seed, progress=terminal, **species
+    )
+    minutes = (time.perf_counter() - start) / 60
+    show(f"outline trained in {minutes:.0f} min, loss {losses['position']:.3f} → {options.out}")
 
 
 def _train_on_labels(options: argparse.Namespace) -> None:

@@ -30,8 +30,8 @@ class FramesConfig:
 
 AUTO, BUILTIN, GENERAL = "auto", "builtin", "general"
 """Names of segmenters in place of a file."""
-NONE = "none"
-"""Name of no keypoint network, in place of a file."""
+OUTLINE = "outline"
+"""Name of the keypoint network that sees outlines only, in place of a file."""
 
 
 @config_dataclass
@@ -59,17 +59,18 @@ class SegmenterConfig:
     """Overlap of neighbouring tiles as a fraction of the tile's side; an overlap wider than a bird works best."""
 
 
-Background = Literal["black", "visible"]
-"""What the crop of a bird shows around the bird."""
+Background = Literal["black", "visible", "outline"]
+"""What the crop of a bird shows around the bird; `outline` shows the masks alone."""
 
 
 @config_dataclass
 class KeypointsConfig:
     """The network that detects the keypoints of each bird."""
 
-    file: str = "builtin"
-    """Network that detects keypoints: `builtin` (for murres, trained on simulated footage), an ONNX file, or `none`
-    (the poses follow from the outlines)."""
+    file: str = AUTO
+    """Network that detects keypoints: `builtin` (for murres, trained on simulated footage), `outline` (for all birds,
+    from the masks alone), `auto` (`outline` if a general segmenter detects the birds, or else `builtin`), or an ONNX
+    file."""
     kind: str = "auto"
     """Layout of the network's output: heatmap, deeplabcut, simcc; `auto` infers the layout from the file's inputs and
     outputs."""

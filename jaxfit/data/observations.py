@@ -36,10 +36,10 @@ CELLS = tuple(name for name, (shape, _) in _LAYOUT.items() if shape.startswith("
 """Arrays with a value for every track and frame."""
 LARGEST_POSITION_PX = 1e6
 """Largest absolute image position; greater numbers overflow or have a wrong unit."""
-KEYPOINT_ORIGINS = "", "label", "flow"
+KEYPOINT_ORIGINS = "", "label", "flow", "outline"
 """Where the keypoints of a bird in a frame come from: a detector or a file that does not say so; a person; a person's
-label in another frame, by optical flow."""
-FROM_LABEL, FROM_FLOW = 1, 2
+label in another frame, by optical flow; the network that sees the mask alone."""
+FROM_LABEL, FROM_FLOW, FROM_OUTLINE = 1, 2, 3
 MIN_KEYPOINTS = 3
 """Fewer keypoints do not determine the orientation of a bird."""
 MAPPINGS = ("masks", "amodal_masks", "own_images")
@@ -225,12 +225,12 @@ class Observations:
     def usable(self, min_keypoints: int = MIN_KEYPOINTS) -> np.ndarray:
         """Return where a bird can be fitted, (N, T) bool: it is present with ``min_keypoints``.
 
-        With 0, a bird without any keypoint can be fitted if it has a mask.
+        With 0, a bird without any keypoint can be fitted if it has a mask, and its track a keypoint in another frame.
         """
         known = (self.confidence > 0).sum(-1)
         usable = self.present & (known >= min_keypoints)
         for n, t in np.argwhere(usable & (known == 0)).tolist():
-            usable[n, t] = (n, t) in self.masks
+            usable[n, t] = (n, t) in self.masks and known[n].any()
         return usable
 
     def select(self, tracks: Any = None, frames: Any = None) -> Observations:

@@ -308,8 +308,8 @@ def windows_of(observations: Observations, config: FitConfig, source: object) ->
     if len(windows) == 0:
         raise InputError(
             source,
-            f"no track has a frame with {config.min_keypoints} confident keypoints",
-            "detect more keypoints, or lower min_keypoints in the config: with 0, masks are enough",
+            f"no track has a frame with {max(config.min_keypoints, 1)} confident keypoints",
+            "detect more keypoints, or lower min_keypoints in the config: with 0, masks are enough for `jaxfit fit`",
         )
     return windows
 

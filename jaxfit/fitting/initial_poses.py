@@ -20,10 +20,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfit.config.fit import InitialiseConfig
-from jaxfit.data.observations import MIN_KEYPOINTS, Observations
+from jaxfit.data.observations import Observations
 from jaxfit.data.solution import LAYOUT, check_poses
 from jaxfit.data.tracks import positions_in
-from jaxfit.fitting.outlines import OUTLINE_KEYPOINTS, OutlineMatch
 from jaxfit.fitting.stored_programs import StoredProgram
 from jaxfit.fitting.tiles import join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.fitting.windows import Windows
@@ -139,43 +138,31 @@ def _orientations(
     model_keypoints: Float[Array, "K 3"],
     keypoints_px: Float[Array, "T K 2"],
     confidence: Float[Array, "T K"],
-    outlines: OutlineMatch | None,
     config: InitialiseConfig,
-) -> tuple[Float[Array, "H T 3 3"], Float[Array, "H T"], Int[Array, "H T"]]:
-    """Return orientations, scales (pixels per model unit) and candidates of the H best distinct sequences of a window.
-
-    With outlines, a frame with fewer than `MIN_KEYPOINTS` keypoints has the scale of its outline.
-    """
-    has_target = jnp.any(confidence > 0, axis=1)
-    frames = jnp.arange(len(has_target))
-    match = jax.lax.map(lambda frame: match_candidates(candidates, model_keypoints, *frame), (keypoints_px, confidence))
-    cost_of_frame, scale_px = match
-    if outlines is not None:
-        squared = jnp.asarray(outlines.distance_px) ** 2
-        cost_of_frame += OUTLINE_KEYPOINTS * SIGMA_PX**2 * squared / (SIGMA_PX**2 + squared)
-        by_outline = outlines.known & (jnp.sum(confidence > 0, axis=1) < MIN_KEYPOINTS)
-        scale_px = jnp.where(by_outline[:, None], outlines.scale_px, scale_px)
-        has_target = has_target | outlines.known
-    # a frame without targets has the candidates of the nearest frame with targets, with a matching cost of 0
-    distance = jnp.abs(frames[:, None] - frames) + jnp.where(has_target, 0, len(frames))
+) -> tuple[Float[Array, "H T 3 3"], Float[Array, "H T"]]:
+    """Return orientations and scales (pixels per model unit) of the H best distinct sequences of one window."""
+    has_keypoints = jnp.any(confidence > 0, axis=1)
+    frames = jnp.arange(len(has_keypoints))
+    # a frame without keypoints has the candidates of the nearest frame with keypoints, with a matching cost of 0
+    distance = jnp.abs(frames[:, None] - frames) + jnp.where(has_keypoints, 0, len(frames))
     nearest = jnp.argmin(distance, axis=1)
-    cost = cost_of_frame[nearest]
+    match = jax.lax.map(lambda frame: match_candidates(candidates, model_keypoints, *frame), (keypoints_px, confidence))
+    cost = match.cost[nearest]
     # Further hypotheses: the best sequence among candidates that are far from all earlier hypotheses in every frame.
     # Only the `candidates` best orientations of a frame take part, because the time grows with the square of their
     # number.
     exclusion = jnp.zeros_like(cost)
-    orientations, scales, sequences = [], [], []
+    orientations, scales = [], []
     for _ in range(config.hypotheses):
         _, index = jax.lax.top_k(-(cost + exclusion), min(config.candidates, cost.shape[1]))
-        frame_cost = jnp.take_along_axis(cost + exclusion, index, axis=1) * has_target[:, None]
+        frame_cost = jnp.take_along_axis(cost + exclusion, index, axis=1) * has_keypoints[:, None]
         path = choose_sequence(frame_cost, candidates[index], config.smoothness)
         chosen = index[frames, path]
         orientations.append(candidates[chosen])
-        scales.append(scale_px[nearest, chosen])
-        sequences.append(chosen)
+        scales.append(match.scale_px[nearest, chosen])
         trace = jnp.einsum("tij,cij->tc", candidates[chosen], candidates)  # tr(RaᵀRb) = 1 + 2 cos θ
         exclusion = jnp.where((trace - 1) / 2 > np.cos(MIN_SEPARATION_RAD), EXCLUDED_COST, exclusion)
-    return jnp.stack(orientations), jnp.stack(scales), jnp.stack(sequences)
+    return jnp.stack(orientations), jnp.stack(scales)
 
 
 def search_initial_poses(
@@ -186,7 +173,6 @@ def search_initial_poses(
     config: InitialiseConfig,
     camera: CropCamera,
     common_size: bool,
-    outlines: OutlineMatch | None = None,
 ) -> Pose:
     """Return initial poses of W windows: H hypotheses with the mean body pose, at a depth with scale ≈ 1.
 
@@ -198,7 +184,6 @@ def search_initial_poses(
         config: candidates and hypotheses.
         camera: the crop camera.
         common_size: whether the window has one scale, instead of one scale per frame.
-        outlines: the match of the candidates to the masks, with a leading axis W; None uses keypoints alone.
 
     Returns:
         A Pose with leading axes W, H, then T.
@@ -207,7 +192,7 @@ def search_initial_poses(
     """
     count, frames = keypoints_px.shape[:2]
     found = [
-        _search_tile(bird, rig, *take_tile((keypoints_px, confidence, outlines), rows), config, camera, common_size)
+        _search_tile(bird, rig, *take_tile((keypoints_px, confidence), rows), config, camera, common_size)
         for rows in tile_rows(count, tile_size(frames))
     ]
     orient, transl, scale = join_tiles(found, count)
@@ -222,7 +207,6 @@ def _search_tile(
     rig: Rig,
     keypoints_px: Float[Array, "G T K 2"],
     confidence: Float[Array, "G T K"],
-    outlines: OutlineMatch | None,
     config: InitialiseConfig,
     camera: CropCamera,
     common_size: bool,
@@ -235,7 +219,7 @@ def _search_tile(
     # no orientation matches wrong keypoints well, so their scale is almost 0 and the depth would be extreme
     min_scale_px = MIN_SPAN * camera.size_px / jnp.ptp(model_keypoints, axis=0).max()
 
-    def initial_pose(R, scale_px, chosen, keypoints_px, confidence, outlines) -> tuple[Array, Array, Array]:
+    def initial_pose(R, scale_px, keypoints_px, confidence) -> tuple[Array, Array, Array]:
         window_scale_px = jnp.maximum(jnp.median(scale_px), min_scale_px)
         # pixels per model unit = f·scale/z: the median frame has the size of the model, other frames keep their ratio
         # to it
@@ -247,23 +231,17 @@ def _search_tile(
         # at this depth, the shift aligns the mean of the model's keypoints with the mean of the detected keypoints
         weight = confidence[..., None] / jnp.maximum(jnp.sum(confidence, axis=1), 1e-6)[:, None, None]
         offset_px = jnp.sum(weight * (keypoints_px - camera.centre_px), axis=1)
-        model_xy = jnp.sum(weight * scaled, axis=1)[:, :2]
-        if outlines is not None:  # or the centre of the silhouette with the centre of the mask
-            by_outline = (outlines.known & (jnp.sum(confidence > 0, axis=1) < MIN_KEYPOINTS))[:, None]
-            offset_px = jnp.where(by_outline, outlines.middle_px - camera.centre_px, offset_px)
-            model_xy = jnp.where(by_outline, (outlines.middle[chosen] + root[:2]) * scale[:, None], model_xy)
-        xy = offset_px * depth / camera.focal_px - model_xy
+        xy = offset_px * depth / camera.focal_px - jnp.sum(weight * scaled, axis=1)[:, :2]
         z = jnp.broadcast_to(depth - scale * root[2], (frames,))  # the root joint is at this depth
         transl = jnp.concatenate([xy, z[:, None]], axis=-1)
         return unwrap_axis_angle(matrix_to_axis_angle(R)), transl, scale
 
-    def search_window(targets: tuple[Array, Array, OutlineMatch | None]) -> tuple[Array, Array, Array]:
-        points_px, confidence, outlines = targets
-        found = _orientations(candidates, model_keypoints, points_px, confidence, outlines, config)
-        return jax.vmap(lambda R, scale_px, chosen: initial_pose(R, scale_px, chosen, *targets))(*found)
+    def search_window(detections: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        R, scale_px = _orientations(candidates, model_keypoints, *detections, config)
+        return jax.vmap(initial_pose, (0, 0, None, None))(R, scale_px, *detections)
 
     batch_size = max(1, 100 // frames)  # a window of 100 frames × 2,400 candidates needs about 100 MB
-    return jax.lax.map(search_window, (keypoints_px, confidence, outlines), batch_size=batch_size)
+    return jax.lax.map(search_window, (keypoints_px, confidence), batch_size=batch_size)
 
 
 _FIELDS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "crop")

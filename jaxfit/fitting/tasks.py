@@ -15,11 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfit.config.fit import FitConfig, InitialiseConfig
-from jaxfit.data.observations import MIN_KEYPOINTS
 from jaxfit.fitting.batch import Batch, FittedWindow, fit_batch, frames_per_batch
 from jaxfit.fitting.bodies import Body, estimate_bodies, stages_of_pass
 from jaxfit.fitting.initial_poses import search_initial_poses
-from jaxfit.fitting.outlines import drawn_bodies, match_outlines
 from jaxfit.fitting.solve import FitModel, needs_mask
 from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
 from jaxfit.fitting.tiles import tile_size
@@ -29,9 +27,6 @@ from jaxfit.foundation.workers import Cluster, FailedTask
 from jaxfit.model.kinematics import Pose, rest_pose
 
 _logger = logging.getLogger(__name__)
-
-OUTLINE_PX = 96
-"""Side of the masks whose outlines are matched to orientations."""
 
 
 class Start(NamedTuple):
@@ -129,14 +124,8 @@ def initial_poses_of(windows: Windows, config: FitConfig, model: FitModel) -> Po
         return model.initial_poses.window_poses(model.bird, windows, config.common_size)
 
     def search(some: Windows, how: InitialiseConfig) -> Pose:
-        outlines = None
-        if config.min_keypoints < MIN_KEYPOINTS and some.views is None and some.has_mask.any():
-            masks, bodies = load_targets(some, OUTLINE_PX).mask, drawn_bodies(model.bird)
-            pairs = zip(masks, some.has_mask, strict=True)
-            matches = [match_outlines(own, has_mask, bodies, how) for own, has_mask in pairs]
-            outlines = jax.tree.map(lambda *x: np.stack(x), *matches)
         detections = some.keypoints_px, some.confidence
-        return search_initial_poses(model.bird, model.rig, *detections, how, model.camera, config.common_size, outlines)
+        return search_initial_poses(model.bird, model.rig, *detections, how, model.camera, config.common_size)
 
     how = config.initialise
     if how.method != "auto":

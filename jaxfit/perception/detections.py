@@ -14,11 +14,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfit.config.checks import require
-from jaxfit.config.perception import AUTO, BUILTIN, NONE, FramesConfig, TrackConfig
+from jaxfit.config.perception import AUTO, BUILTIN, OUTLINE, FramesConfig, TrackConfig
 from jaxfit.foundation.errors import one_line
 from jaxfit.foundation.progress import Clock
 from jaxfit.foundation.unfinished import Parts
-from jaxfit.perception.keypoints import BUILTIN_PATH, NoKeypoints, load_keypoint_detector
+from jaxfit.perception.general_networks import DETECTORS
+from jaxfit.perception.keypoints import keypoint_file, load_keypoint_detector
 from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
 from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
 from jaxfit.perception.tracking import RecordedFrame, Tracker, record_frame
@@ -69,10 +70,8 @@ def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
         InputError: the keypoint detector cannot be used.
     """
     settings = config.keypoints
-    if settings.file == NONE:
-        return NoKeypoints()
     return load_keypoint_detector(
-        settings.file,
+        keypoint_name(config),
         kind=settings.kind,
         names=settings.names or None,
         pad_px=settings.pad_px,
@@ -85,9 +84,20 @@ def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
 
 def network_files(config: TrackConfig) -> dict[str, list[Path]]:
     """Return the files of the networks of a config, under the keys `segmenter` and `keypoints`."""
-    file = config.keypoints.file
-    keypoints = [] if file == NONE else [BUILTIN_PATH if file == "builtin" else Path(file)]
+    keypoints = [keypoint_file(keypoint_name(config))]
     return {"segmenter": segmenter_files(_segmenter_name(config)), "keypoints": keypoints}
+
+
+def keypoint_name(config: TrackConfig) -> str:
+    """Return the name of the keypoint network of a config; `auto` stands for `outline` with a general segmenter.
+
+    The built-in keypoint network knows murres, which the built-in segmenter, and usually one that a user has trained,
+    detects.
+    """
+    if config.keypoints.file != AUTO:
+        return config.keypoints.file
+    segmenter = _segmenter_name(config)
+    return OUTLINE if segmenter in DETECTORS or "+" in segmenter else BUILTIN
 
 
 def _segmenter_name(config: TrackConfig) -> str:

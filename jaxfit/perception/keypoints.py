@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Num, UInt8
 
+from jaxfit.config.perception import BUILTIN, OUTLINE
+from jaxfit.data.keypoint_names import map_keypoints, propose_names
+from jaxfit.data.masks import decode_mask
+from jaxfit.data.observations import FROM_OUTLINE, MIN_KEYPOINTS, Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, MURRE_KEYPOINTS
 from jaxfit.perception.keypoint_layouts import (
@@ -21,10 +26,20 @@ from jaxfit.perception.keypoint_layouts import (
     read_input,
     read_metadata,
 )
-from jaxfit.perception.network import CONFIDENCE_KEY, OUTPUT, Instance, OnnxModel, activation_monitor, read_curve
+from jaxfit.perception.network import (
+    CONFIDENCE_KEY,
+    OUTPUT,
+    Instance,
+    OnnxModel,
+    activation_monitor,
+    instance_of,
+    read_curve,
+)
 
 PAD_PX = 40
-DILATE_PX = {"black": 70, "visible": 14}
+OUTLINE_MARGIN = 0.15
+"""Margin around the box of an outline, as a share of its longer side: room for parts that the mask lacks."""
+DILATE_PX = {"black": 70, "visible": 14, "outline": 0}
 """Defaults of `crop_bird` for each background, for footage in which birds are about 250 pixels long; 40 and 70 are the
 paper's."""
 
@@ -105,6 +120,29 @@ def crop_bird(
     return cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA if is_reduction else cv2.INTER_LINEAR), crop
 
 
+def crop_outline(
+    shape: tuple[int, ...], birds: Sequence[Instance], n: int, size_px: tuple[int, int]
+) -> tuple[UInt8[np.ndarray, "h w 3"], Crop]:
+    """Draw the masks around one bird, without the picture; the margin is `OUTLINE_MARGIN`.
+
+    Args:
+        shape: height and width of the frame.
+        birds: all birds of the frame.
+        n: position of the bird.
+        size_px: width and height of the result.
+
+    Returns:
+        Three channels, 255 in the bird, in other birds and outside the frame, and the crop as in `crop_bird`.
+    """
+    crop = _padded_box(birds[n], size_px, round(OUTLINE_MARGIN * max(birds[n].mask.shape)))
+    own, others = _mask_in(crop, [birds[n]]), _mask_in(crop, [*birds[:n], *birds[n + 1 :]])
+    outside = np.ones_like(own)
+    outside[max(-crop.y0, 0) : max(shape[0] - crop.y0, 0), max(-crop.x0, 0) : max(shape[1] - crop.x0, 0)] = 0
+    picture = 255 * np.stack([own, others, outside], axis=-1)
+    is_reduction = crop.width >= size_px[0] and crop.height >= size_px[1]
+    return cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA if is_reduction else cv2.INTER_LINEAR), crop
+
+
 def _mask_in(crop: Crop, birds: Sequence[Instance]) -> UInt8[np.ndarray, "h w"]:
     """Return 1 where the box of a crop shows one of the birds, else 0."""
     mask = np.zeros((crop.height, crop.width), np.uint8)
@@ -138,12 +176,15 @@ class CropSettings(NamedTuple):
     pad_px: int = PAD_PX
     dilate_px: int = DILATE_PX["black"]
     background: str = "black"
-    """`black` outside the dilated mask of the bird, or `visible` except other birds (`crop_bird`)."""
+    """`black` outside the dilated mask of the bird, or `visible` except other birds (`crop_bird`); `outline` for masks
+    in place of the picture (`crop_outline`)."""
 
     def crop(
         self, frame: UInt8[np.ndarray, "H W 3"], birds: Sequence[Instance], n: int, size_px: tuple[int, int]
     ) -> tuple[UInt8[np.ndarray, "h w 3"], Crop]:
-        """Crop bird n of all birds of a frame, as `crop_bird` describes."""
+        """Crop bird n of all birds of a frame, as `crop_bird` or `crop_outline` describes."""
+        if self.background == "outline":
+            return crop_outline(frame.shape[:2], birds, n, size_px)
         neighbours = None if self.background == "black" else [*birds[:n], *birds[n + 1 :]]
         return crop_bird(frame, birds[n], size_px, self.pad_px, self.dilate_px, neighbours)
 
@@ -164,7 +205,8 @@ def _first_given(*values: int | None) -> int:
     return next(value for value in values if value is not None)
 
 
-BUILTIN_PATH = Path(__file__).parent / "networks" / "keypoints.onnx"
+BUILTIN_PATH, OUTLINE_PATH = (Path(__file__).parent / "networks" / name for name in ("keypoints.onnx", "outline.onnx"))
+_PATHS = {BUILTIN: BUILTIN_PATH, OUTLINE: OUTLINE_PATH}
 NAME_SETS = {"murre": MURRE_KEYPOINTS, "aves": AVES_KEYPOINTS, "avian-mesh": AVIAN_MESH_KEYPOINTS}
 
 
@@ -186,6 +228,7 @@ class OnnxKeypoints:
         self.keypoint_names = tuple(keypoint_names)
         self._model, self._input, self._layout = model, network_input, layout
         self._crops = crops
+        self.sees_outlines = crops.background == "outline"
         self._batch = network_input.batch or batch
         self._shapes = shapes
         self.activations = activation_monitor(model)
@@ -230,20 +273,13 @@ class OnnxKeypoints:
         return self._input.array(batch), crops
 
 
-class NoKeypoints:
-    """A keypoint detector without keypoints, for footage whose keypoints come from labels, or not at all."""
-
-    keypoint_names: tuple[str, ...] = ()
-
-    def __call__(
-        self, frame: UInt8[np.ndarray, "H W 3"], instances: Sequence[Instance]
-    ) -> tuple[Float[np.ndarray, "M 0 2"], Float[np.ndarray, "M 0"]]:
-        """Return arrays without keypoints."""
-        return np.zeros((len(instances), 0, 2), np.float32), np.zeros((len(instances), 0), np.float32)
+def keypoint_file(spec: str | Path) -> Path:
+    """Return the file of a keypoint network: `builtin`, `outline`, or an ONNX file."""
+    return _PATHS.get(str(spec), Path(spec))
 
 
 def load_keypoint_detector(
-    spec: str | Path = "builtin",
+    spec: str | Path = BUILTIN,
     *,
     kind: str = "auto",
     names: Sequence[str] | str | None = None,
@@ -256,7 +292,8 @@ def load_keypoint_detector(
     """Load a keypoint network; its inputs and outputs determine its layout.
 
     Args:
-        spec: `builtin`, or an ONNX file; `jaxfit.perception.keypoint_layouts` describes its optional metadata.
+        spec: `builtin`, `outline`, or an ONNX file, whose optional metadata `jaxfit.perception.keypoint_layouts`
+            describes.
         kind: one of `KINDS`; `auto` uses the layout that fits.
         names: names of the keypoints in the order of the output, or a key of `NAME_SETS`; None or empty uses the
             names in the file.
@@ -269,7 +306,7 @@ def load_keypoint_detector(
         InputError: the file does not exist, is not a keypoint network, has an unknown layout or not three channels,
             or the names are missing or of the wrong number.
     """
-    model = OnnxModel(BUILTIN_PATH if spec == "builtin" else spec, threads)
+    model = OnnxModel(keypoint_file(spec), threads)
     metadata = read_metadata(model)
     network_input = read_input(model, metadata)
     width, height = network_input.size_px
@@ -302,3 +339,46 @@ def _choose_names(model: OnnxModel, count: int, given: Sequence[str] | str | Non
         remedy = f"give one name for each keypoint in the order of the output: {model.describe()}"
         raise InputError(model.path, problem, remedy)
     return names
+
+
+def with_outline_keypoints(observations: Observations) -> Observations:
+    """Return the observations with the keypoints of the network `outline` where a bird has a mask and no keypoint.
+
+    Args:
+        observations: masks of birds; keypoints that a model with three or more keypoints of the network has. Other
+            observations do not change.
+    """
+    detector = load_keypoint_detector(OUTLINE)
+    names = propose_names(detector.keypoint_names, observations.keypoint_names)
+    alone = observations.present & ~observations.confidence.any(-1)
+    if len(names.mapped) < MIN_KEYPOINTS or not alone.any():
+        return observations
+    shape = (*observations.present.shape, len(detector.keypoint_names))
+    points_px, confidence = np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32)
+    for t in np.flatnonzero(alone.any(0)).tolist():
+        pictures: dict[str, list[int]] = {}
+        for n in np.flatnonzero(observations.present[:, t]).tolist():
+            if observations.masks.get((n, t)) is not None:
+                pictures.setdefault(observations.image_file(n, t), []).append(n)
+        for rows in pictures.values():
+            masks = [instance_of(decode_mask(observations.masks[n, t]), 1.0, "") for n in rows]
+            seen = [n for n, mask in zip(rows, masks, strict=True) if mask is not None]
+            width, height = observations.image_size(rows[0], t)
+            blank = np.broadcast_to(np.zeros(3, np.uint8), (height, width, 3))
+            points_px[seen, t], confidence[seen, t] = detector(blank, [mask for mask in masks if mask is not None])
+    own = replace(
+        observations,
+        keypoint_names=detector.keypoint_names,
+        keypoints_px=points_px,
+        confidence=confidence * alone[..., None],
+        occluded=None,
+        skeleton=(),
+    )
+    own = map_keypoints(own, names, observations.keypoint_names)
+    added = alone & own.confidence.any(-1)
+    return replace(
+        observations,
+        keypoints_px=np.where(added[..., None, None], own.keypoints_px, observations.keypoints_px),
+        confidence=np.where(added[..., None], own.confidence, observations.confidence),
+        keypoint_origin=np.where(added, FROM_OUTLINE, cast(np.ndarray, observations.keypoint_origin)),
+    )

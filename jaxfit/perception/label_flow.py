@@ -32,7 +32,7 @@ from jaxfit.data.formats.mask_files import assign_masks
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.keypoint_names import map_keypoints, names_in_model
 from jaxfit.data.masks import box_of_rle, decode_mask
-from jaxfit.data.observations import FROM_FLOW, FROM_LABEL, Observations
+from jaxfit.data.observations import FROM_FLOW, FROM_LABEL, FROM_OUTLINE, Observations
 from jaxfit.data.tracks import positions_in
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
@@ -115,7 +115,9 @@ def carry_labels(
     source: object = "labels",
     progress: ProgressTask = silent,
 ) -> CarriedLabels:
-    """Return the observations with the keypoints of labels in place of their own, carried to all frames by flow.
+    """Return the observations with the keypoints of labels, carried to all frames by flow, in place of their own.
+
+    Keypoints from the outline remain where no label is carried to.
 
     A labelled bird belongs to the track whose mask covers its keypoints. A label that contradicts its neighbours, which
     agree with each other, is left out.
@@ -161,8 +163,12 @@ def carry_labels(
     confidence[~observations.present] = 0
     for problem in problems:
         _logger.warning("%s: %s", source, problem)
+    own = (np.asarray(observations.keypoint_origin) == FROM_OUTLINE) & ~confidence.any(-1)
+    confidence = np.where(own[..., None], observations.confidence, confidence)
+    points = np.where(own[..., None, None], observations.keypoints_px, points)
+    origin = np.where(own, FROM_OUTLINE, np.where(observations.present, origin, 0))
     points = np.where(confidence[..., None] > 0, points, 0)
-    changed = replace(observations, occluded=None, keypoint_origin=np.where(observations.present, origin, 0))
+    changed = replace(observations, occluded=None, keypoint_origin=origin)
     return CarriedLabels(changed.with_keypoints(points, confidence), used, tuple(problems))
 
 
@@ -437,7 +443,7 @@ def _leave_out_outside(
 def origin_counts(observations: Observations) -> dict[int, dict[str, int]]:
     """Return track → what the poses of frames stand on → number of frames."""
     present, origin = observations.present, np.asarray(observations.keypoint_origin)
-    alone = present & ~observations.confidence.any(-1)
+    alone = present & ((origin == FROM_OUTLINE) | ~observations.confidence.any(-1))
     kinds = {"labels": origin == FROM_LABEL, "flow": origin == FROM_FLOW, "the outline alone": alone}
     return {
         track: {kind: int(where[n].sum()) for kind, where in kinds.items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from jaxfit.data.footage import read_footage
 from jaxfit.data.formats.image_sizes import add_times, check_video
 from jaxfit.data.formats.mask_files import mask_observations
 from jaxfit.data.formats.recognise import read_observations
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import FROM_OUTLINE, Observations
 from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import Clock, ProgressTask, silent
 from jaxfit.foundation.unfinished import Parts
@@ -179,6 +180,8 @@ def run_tracking(
     with clock("clean up"):
         names, footage = keypoints.keypoint_names, read_footage(source, reader.info.frames)
         all_tracks = observations_of(records, names, skeleton_pairs(names), reader.info.fps, footage)
+        if getattr(keypoints, "sees_outlines", False):
+            all_tracks = replace(all_tracks, keypoint_origin=np.where(all_tracks.present, FROM_OUTLINE, 0))
         length = all_tracks.present.sum(1)  # frames with a detection of the bird, not the frames in between
         score = np.where(all_tracks.present, np.asarray(all_tracks.score), 0).sum(1) / np.maximum(length, 1)
         is_short = length < config.min_track_frames

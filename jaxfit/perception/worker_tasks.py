@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxfit.config.perception import FramesConfig, TrackConfig
+from jaxfit.config.perception import BUILTIN, OUTLINE, FramesConfig, TrackConfig
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import Clock
 from jaxfit.foundation.workers import Cluster, FailedTask
@@ -170,7 +170,7 @@ def _with_absolute_paths(config: TrackConfig) -> TrackConfig:
     names = {kind: "+".join(str(file.absolute()) for file in files) for kind, files in network_files(config).items()}
 
     def absolute(settings: Any, kind: str) -> Any:
-        return settings if settings.file == "builtin" else replace(settings, file=names[kind])
+        return settings if settings.file in (BUILTIN, OUTLINE) else replace(settings, file=names[kind])
 
     own = {kind: absolute(getattr(config, kind), kind) for kind in names}
     return replace(config, frames=FramesConfig(), **own)

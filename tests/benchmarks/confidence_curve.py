@@ -1,9 +1,11 @@
 """Fit the curve of confidences of a keypoint network on simulated birds, and store the curve in the network file.
 
     python tests/benchmarks/confidence_curve.py keypoints.onnx scenes
+    python tests/benchmarks/confidence_curve.py outline.onnx outlines.npz
 
 `jaxfit.perception.network` describes the curves and reads them. The built-in segmenter
 detects the birds of `scenes`, a folder of simulated scenes that the network was not trained on, as in tracking.
+`outlines.npz` holds outlines of other seeds (`jaxfit.learning.networks.outlines.draw_outlines`).
 """
 
 from __future__ import annotations
@@ -75,6 +77,23 @@ def keypoint_outcomes(frames: LabelledFrames, segmenter: Segmenter, keypoints: K
     return Outcomes(np.concatenate(values), np.concatenate(right))
 
 
+def outline_outcomes(path: Path, keypoints: KeypointDetector, count: int = 4000) -> Outcomes:
+    """Detect the keypoints of simulated outlines with errors of a segmenter, and compare them as `keypoint_outcomes`.
+
+    The side is that of the mask. Keypoints that are hidden or cut off count, too.
+    """
+    from jaxfit.learning.networks.outlines import draw_scene, load_outlines  # needs PyTorch
+
+    outlines, rng, values, right = load_outlines(path), np.random.default_rng(0), [], []
+    for _ in range(count):
+        scene = draw_scene(rng, outlines)
+        points_px, confidence = keypoints(np.zeros((*scene.shape, 3), np.uint8), scene.birds)
+        values.append(confidence[0])
+        error = np.linalg.norm(points_px[0] - scene.points_px, axis=-1)
+        right.append(error <= RIGHT * max(scene.birds[0].mask.shape))
+    return Outcomes(np.concatenate(values), np.concatenate(right))
+
+
 def fit_curve(outcomes: Outcomes, source: object = "outcomes") -> Curve:
     """Fit a monotone curve from raw values to the share of right detections.
 
@@ -116,12 +135,16 @@ def _longer_side(mask: Bool[np.ndarray, "H W"], points_px: Float[np.ndarray, "M 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Fit the curve of confidences of a keypoint network.")
     parser.add_argument("network", type=Path, help="ONNX file of the keypoint network; it is replaced")
-    parser.add_argument("scenes", type=Path, help="folder of simulated scenes of `jaxfit train`")
+    parser.add_argument("scenes", type=Path, help="folder of simulated scenes of `jaxfit train`, or file of outlines")
     options = parser.parse_args()
-    known = load_frames(*sorted(options.scenes.glob("scene_*")))
     detector = load_keypoint_detector(options.network)
     detector.curve = None  # a curve that the file holds is replaced
-    curve = fit_curve(keypoint_outcomes(known, load_segmenter("builtin"), detector), options.network)
+    if options.scenes.is_dir():
+        known = load_frames(*sorted(options.scenes.glob("scene_*")))
+        outcomes = keypoint_outcomes(known, load_segmenter("builtin"), detector)
+    else:
+        outcomes = outline_outcomes(options.scenes, detector)
+    curve = fit_curve(outcomes, options.network)
     from jaxfit.learning.networks.network_files import set_metadata  # needs PyTorch
 
     set_metadata(options.network, {CONFIDENCE_KEY: curve.text()})

@@ -65,7 +65,7 @@ def test_masks_alone_become_poses(inputs, tmp_path, capsys):
     search = "  min_keypoints: 0\n  initialise: {method: so3, directions: 20, turns: 8}\n"
     (inputs / "outlines.yaml").write_text(QUICK.replace("  base: paper\n", "  base: paper\n" + search))
     given = ["--masks", str(inputs / "masks"), "--model", str(inputs / "toy.npz"), "--out", str(tmp_path / "result")]
-    config = ["--config", str(inputs / "outlines.yaml"), "--keypoints", "none"]
+    config = ["--config", str(inputs / "outlines.yaml")]
     assert main(["reconstruct", str(inputs / "frames"), *given, *config]) == 0
     assert f"poses of track 3: {FRAMES} frames on the outline alone" in capsys.readouterr().out
     solution, _ = load_solution(tmp_path / "result")

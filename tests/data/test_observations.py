@@ -115,6 +115,13 @@ def test_usable():
     np.testing.assert_array_equal(make().usable(min_keypoints=2), [[True, True, False], [False, True, True]])
 
 
+def test_a_mask_is_enough_beside_frames_with_keypoints():
+    confidence = np.zeros((2, 3, 3))
+    confidence[1, 1] = 1
+    seen = make(confidence=confidence, masks={(0, 1): encode_mask(MASK), (1, 2): encode_mask(MASK)})
+    np.testing.assert_array_equal(seen.usable(0), [[False] * 3, [False, True, True]])
+
+
 def test_keypoints_that_no_bird_has_do_not_count():
     confidence = np.array([[[0.5, 0, 1.0], [0, 0, 0.5]], [[0, 0, 0], [1.0, 0, 1.0]]], np.float32)
     np.testing.assert_array_equal(mean_confidence(confidence), [[0.75, 0.25], [0, 1]])

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from support.toy_footage import BIRD, BIRDS, FRAMES, SIDE, Footage, TrueKeypoints, TrueSegmenter
 
-from jaxfit.config.perception import FramesConfig, SegmenterConfig, TrackConfig, TrackerConfig
+from jaxfit.config.perception import FramesConfig, KeypointsConfig, SegmenterConfig, TrackConfig, TrackerConfig
+from jaxfit.data.observations import FROM_OUTLINE
 from jaxfit.foundation.errors import InputError
+from jaxfit.model.anatomy import AVES_KEYPOINTS
 from jaxfit.perception import track
 from jaxfit.perception.track import open_segmenter, run_tracking, track_video
 from jaxfit.video.writer import VideoWriter
@@ -49,6 +51,13 @@ def test_tracks_are_the_truth(video):
         whole[:, SIDE * column : SIDE * (column + 1)] = FOOTAGE.masks[5][column]
         np.testing.assert_array_equal(found.mask(n, 5), whole)
         assert found.score[n, 5] == pytest.approx(0.9 - 0.1 * column)
+
+
+def test_keypoints_of_outlines_say_so(video):
+    config = TrackConfig(keypoints=KeypointsConfig(file="outline"), min_track_frames=2)
+    found = run_tracking(video, config, TrueSegmenter(FOOTAGE)).observations
+    assert found.keypoint_names == AVES_KEYPOINTS
+    assert (found.keypoint_origin == FROM_OUTLINE).all()
 
 
 def test_a_range_of_frames(video):

@@ -84,7 +84,10 @@ class KeypointMaps(nn.Module):
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Compute maps (B, K, h, w) within 0 and 1 from pictures (B, 3, H, W)."""
-        logits = self.network(pictures)["logits"]
+        return self.peaks(self.network(pictures)["logits"])
+
+    def peaks(self, logits: Tensor) -> Tensor:
+        """Compute the maps from logits (B, K, h, w)."""
         # a softmax over the cells and the class `absent`, whose logit is 0
         highest = logits.amax((2, 3), keepdim=True).clamp(min=0)
         share = torch.exp(logits - highest)
@@ -169,18 +172,18 @@ def _augmented_patch(
     picture = cv2.warpAffine(picture, warp, (side, side), flags=cv2.INTER_LINEAR)
     owner = cv2.warpAffine(owner, warp, (side, side), flags=cv2.INTER_NEAREST)
     others = [k for k in np.unique(owner[owner > 0]).tolist() if k != n + 1]
-    instance = instance_of(_faulty_mask(rng, owner == n + 1, owner > 0), 1.0, "")
+    instance = instance_of(faulty_mask(rng, owner == n + 1, owner > 0), 1.0, "")
     if instance is None:
         return None
     detected = [k for k in others if rng.random() >= UNDETECTED_SHARE]
-    neighbours = (instance_of(_faulty_mask(rng, owner == k, owner > 0), 1.0, "") for k in detected)
+    neighbours = (instance_of(faulty_mask(rng, owner == k, owner > 0), 1.0, "") for k in detected)
     birds = [instance, *(bird for bird in neighbours if bird is not None)]
     picture = randomise_appearance(rng, picture, owner > 0, scene_share)
     points_px = (points_px - low) @ affine[:, :2].T + affine[:, 2]
     return _Patch(picture, birds, points_px, visibility, float(relative_scale * factor))
 
 
-def _faulty_mask(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) -> np.ndarray:
+def faulty_mask(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) -> np.ndarray:
     """Return a mask with a random error of a segmenter, one of `_MASK_ERRORS`."""
     error = str(rng.choice(list(_MASK_ERRORS), p=list(_MASK_ERRORS.values())))
     rows, columns = np.nonzero(mask)
@@ -249,7 +252,13 @@ def loss(maps: dict[str, Tensor], sample: Any) -> dict[str, Tensor]:
         maps: outputs of the network.
         sample: a batch, a KeypointSample of tensors.
     """
-    logits = maps["logits"].float()
+    entropy = entropies(maps["logits"], sample)
+    return {"position": (entropy * sample.weight).sum() / sample.weight.sum().clamp(min=1)}
+
+
+def entropies(logits: Tensor, sample: Any) -> Tensor:
+    """Return the cross-entropy of every keypoint, (B, K)."""
+    logits = logits.float()
     B, K, h, w = logits.shape
     x, y = (torch.arange(side, device=logits.device) + 0.5 for side in (w, h))
     target_x = torch.exp(-0.5 * ((x - sample.position[..., :1]) / SIGMA_CELLS) ** 2)
@@ -258,5 +267,4 @@ def loss(maps: dict[str, Tensor], sample: Any) -> dict[str, Tensor]:
     target = target / target.sum(-1, keepdim=True).clamp(min=1e-6) * sample.present[..., None]
     target = torch.cat([target, 1 - sample.present[..., None]], dim=-1)
     log_probability = functional.log_softmax(functional.pad(logits.reshape(B, K, h * w), (0, 1)), dim=-1)
-    entropy = -(target * log_probability).sum(-1)
-    return {"position": (entropy * sample.weight).sum() / sample.weight.sum().clamp(min=1)}
+    return -(target * log_probability).sum(-1)

@@ -30,7 +30,7 @@ from jaxfit.data.keypoint_names import propose_names
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
-from jaxfit.learning.networks import keypoints
+from jaxfit.learning.networks import keypoints, outlines
 from jaxfit.learning.networks.augment import randomise_appearance
 from jaxfit.learning.networks.keypoints import CROPS, keypoint_network
 from jaxfit.learning.networks.labelled_frames import LabelledFrames
@@ -137,7 +137,7 @@ def write_network(
     """Write a trained network to an ONNX file.
 
     Args:
-        which: `segmenter` or `keypoints`.
+        which: `segmenter`, `keypoints` or `outline`.
         network: the trained network.
         facts: metadata about the training.
         path: the `.onnx` file; an existing file is replaced.
@@ -151,7 +151,8 @@ def write_network(
         example, axes = torch.rand(1, 3, 256, 320), {2: "height", 3: "width"}
         export_onnx(Probabilities(network).eval(), example, axes, outputs, metadata, path)
         return
-    side = keypoints.SIDE_PX
+    is_outline = which == "outline"
+    side = outlines.SIDE_PX if is_outline else keypoints.SIDE_PX
     metadata = {
         "keypoint_names": ",".join(names),
         "mean": "0",
@@ -161,8 +162,8 @@ def write_network(
         **{key: str(value) for key, value in crops._asdict().items()},
         **facts,
     }
-    exported = keypoints.KeypointMaps(network, len(names)).eval()
-    export_onnx(exported, torch.rand(2, 3, side, side), {0: "birds"}, ("heatmaps",), metadata, path)
+    exported = outlines.OutlineMaps(network) if is_outline else keypoints.KeypointMaps(network, len(names))
+    export_onnx(exported.eval(), torch.rand(2, 3, side, side), {0: "birds"}, ("heatmaps",), metadata, path)
 
 
 _REMEDY = "give `builtin`, or a network that this version of `jaxfit train` wrote"

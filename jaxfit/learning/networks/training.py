@@ -21,8 +21,8 @@ from jaxfit.foundation.extras import own_version
 from jaxfit.foundation.files import check_writable, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.reading import reading
-from jaxfit.learning.networks import keypoints, segmenter
-from jaxfit.learning.networks.labelled_frames import LabelledFrames, load_frames
+from jaxfit.learning.networks import keypoints, outlines, segmenter
+from jaxfit.learning.networks.labelled_frames import load_frames
 from jaxfit.learning.networks.network_files import (
     base_file,
     freeze_normalisation,
@@ -34,8 +34,11 @@ from jaxfit.learning.networks.network_files import (
 from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.scenes import film_scenes
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
+from jaxfit.model.bird import Bird
 from jaxfit.perception.segmentation import load_segmenter
 
+SPECIES = 600
+"""Number of species in the training of the network `outline`."""
 SCENES = 160
 """Number of training scenes, with seeds from 0; seeds of 1000 and more are for tests."""
 CONTINUED_RATE = 1e-3
@@ -66,7 +69,11 @@ class Schedule(NamedTuple):
         return self.learning_rate * 0.5 * (1 + math.cos(math.pi * (step - rise) / max(self.steps - rise, 1.0)))
 
 
-SCHEDULES = {"segmenter": Schedule(2400, 8, 2e-3), "keypoints": Schedule(4000, 24, 2e-3)}
+SCHEDULES = {
+    "segmenter": Schedule(2400, 8, 2e-3),
+    "keypoints": Schedule(4000, 24, 2e-3),
+    "outline": Schedule(3000, 64, 2e-3),
+}
 """Schedules of networks with random initial weights."""
 
 
@@ -74,12 +81,14 @@ class Source(NamedTuple):
     """Folders of labelled frames, and the samples that are drawn from them."""
 
     folders: tuple[Path, ...]
-    draw: Callable[[np.random.Generator, LabelledFrames], Any]
+    draw: Callable[[np.random.Generator, Any], Any]
     """Draws one sample, a NamedTuple of arrays with the field `picture`; a module-level function or its `partial`."""
     share: float = 1.0
     """Share of the samples; the shares of all sources sum to 1."""
     keypoint_names: tuple[str, ...] | None = None
     """Names of the keypoints of the samples; None keeps the names of the frames."""
+    load: Callable[..., Any] = load_frames
+    """Loads the folders for `draw`."""
 
 
 class Samples(Dataset):
@@ -87,7 +96,7 @@ class Samples(Dataset):
 
     def __init__(self, sources: Sequence[Source], seed: int, first: int, count: int):
         self._sources, self._seed, self._first, self._count = sources, seed, first, count
-        self._frames: dict[int, LabelledFrames] = {}
+        self._frames: dict[int, Any] = {}
 
     def __len__(self) -> int:
         return self._count
@@ -98,8 +107,9 @@ class Samples(Dataset):
         k = 0 if len(shares) == 1 else int(rng.choice(len(shares), p=shares))
         source = self._sources[k]
         if k not in self._frames:  # the process that draws opens the files itself
-            frames = load_frames(*source.folders)
-            self._frames[k] = frames.with_keypoints(source.keypoint_names or frames.keypoint_names)
+            frames = source.load(*source.folders)
+            names = source.keypoint_names
+            self._frames[k] = frames.with_keypoints(names) if names else frames
         return source.draw(rng, self._frames[k])
 
 
@@ -368,13 +378,11 @@ def train_network(
         ValueError: unknown `which`.
         InputError: a number outside its range, or a folder with other contents.
     """
-    if which not in SCHEDULES:
-        raise ValueError(f"which must be one of {', '.join(SCHEDULES)}, not {which!r}")
+    if which not in ("segmenter", "keypoints"):
+        raise ValueError(f"which must be segmenter or keypoints, not {which!r}")
     schedule = schedule or default_schedule(which, base)
     check_numbers(False, schedule.steps, simulation.scenes, seed, varied=simulation.varied, wings=simulation.wings)
-    if Path(path).suffix != ".onnx":
-        raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
-    check_writable(path)  # before the training, not after it
+    _check_name(path)
     torch.manual_seed(seed)
     network = _initial_network(which, base)
     scenes = simulation.scenes
@@ -397,6 +405,60 @@ def train_network(
     birds_of = load_segmenter("builtin") if which == "keypoints" else None
     store_training_activations(which, path, [frames], birds_of, progress)
     return losses
+
+
+def train_outline(
+    path: str | Path,
+    birds: Sequence[Bird],
+    folder: Path,
+    species: int = SPECIES,
+    schedule: Schedule | None = None,
+    seed: int = 0,
+    progress: ProgressTask = silent,
+) -> dict[str, float]:
+    """Train the network that detects keypoints from outlines on simulated outlines, and write it.
+
+    Args:
+        path: the `.onnx` file to write; an existing file is replaced.
+        birds: models from which the species are drawn in turn.
+        folder: folder of the outlines; they are drawn if it lacks them.
+        species, schedule, seed, progress: as in `outlines.draw_outlines` and `train_network`.
+
+    Returns:
+        The term of the loss, averaged over the last tenth of the steps.
+
+    Raises:
+        InputError: a number outside its range.
+    """
+    schedule = schedule or SCHEDULES["outline"]
+    check_numbers(False, schedule.steps, 1, seed)
+    _check_name(path)
+    file = folder / f"outlines_{species}_{'_'.join(bird.name for bird in birds)}_{seed}.npz"
+    if not file.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        drawn = outlines.draw_outlines(birds, species, seed, progress)
+        write_whole(file, lambda opened: np.savez(opened, **drawn._asdict()))
+    torch.manual_seed(seed)
+    network = outlines.outline_network()
+    sources = [Source((file,), outlines.draw_sample, load=outlines.load_outlines)]
+    losses = train(
+        network, outlines.loss, sources, schedule, seed, False, progress=progress, name="Training outline"
+    ).losses
+    facts = {
+        "trained_by": f"jaxfit {own_version()} train outline",
+        "trained_on": f"simulated outlines of {species} species of the models {', '.join(bird.name for bird in birds)}",
+        "schedule": json.dumps(schedule._asdict()),
+        "loss": json.dumps({name: round(value, 5) for name, value in losses.items()}),
+    }
+    write_network("outline", network, facts, path, outlines.NAMES, crops=outlines.CROPS)
+    return losses
+
+
+def _check_name(path: str | Path) -> None:
+    """Check the file of a network before the training, not after it."""
+    if Path(path).suffix != ".onnx":
+        raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
+    check_writable(path)
 
 
 def _initial_network(which: str, base: str | Path | None) -> FeaturePyramid:
