@@ -86,12 +86,17 @@ def test_the_loss_of_pairs_is_that_of_a_mixture():
 def test_exported_maps_hold_both_places_of_a_pair():
     class Fixed(nn.Module):
         def forward(self, pictures):
-            return maps_with_peaks(cells, np.log(3.0))  # p = 3/4
+            maps = maps_with_peaks(cells, np.log(3.0))  # p = 3/4
+            if pictures[0, 0, 0, 0] == 0:  # the mirror image
+                maps["logits"] = maps["logits"].flip(3)[:, OTHER_SIDE]
+            return maps
 
     cells = np.full((len(NAMES), 2), 12)
     left, right = NAMES.index("left_wingtip"), NAMES.index("right_wingtip")
     cells[left], cells[right] = (4, 6), (19, 6)
-    maps = OutlineMaps(Fixed())(torch.zeros(1, 3, SIDE_PX, SIDE_PX))[0].numpy()
+    picture = torch.zeros(1, 3, SIDE_PX, SIDE_PX)
+    picture[0, 0, 0, 0] = 1
+    maps = OutlineMaps(Fixed())(picture)[0].numpy()
     height = maps[NAMES.index("crown"), 12, 12]
     assert maps[left, 6, 4] == pytest.approx(0.75 * height, rel=1e-3)
     assert maps[left, 6, 19] == pytest.approx(0.25 * height, rel=1e-3)
