@@ -16,6 +16,8 @@ from jaxfit.behaviour.rules import OTHER, BehaviourConfig, BehaviourRule, Range
 
 LEVEL, RESAMPLES = 0.95, 2000
 """Level of the intervals of time budgets, and number of resamples of the bootstrap."""
+MIN_BIRDS = 8
+"""Fewer birds have no interval."""
 _EPSILON_S = 1e-6
 NO_POSE = -1
 """State of a bird without a pose."""
@@ -86,7 +88,7 @@ class Budget(NamedTuple):
     bouts: int
     """Number of bouts; 0 for `OTHER`, which is the absence of a behaviour and has no bouts."""
     low: float
-    """Lower end of the interval of the share (`LEVEL`, bootstrap over birds); NaN for one bird."""
+    """Lower end of the interval of the share (`LEVEL`, bootstrap over birds); NaN for one bird or too few birds."""
     high: float
 
 
@@ -251,7 +253,7 @@ def time_budget(ethogram: Ethogram, track_id: Int[np.ndarray, "N"]) -> list[Budg
     """Return the time of each behaviour of all birds together, and of each bird.
 
     The intervals of all birds are percentile intervals of the bootstrap over birds, whose weight is their time with a
-    pose. Frames of one bird depend on each other, so a single bird has no interval.
+    pose. The bootstrap of fewer than `MIN_BIRDS` birds is too narrow, so they have no interval.
     """
     seen = (ethogram.state != NO_POSE) @ ethogram.frame_s
     rows: list[Budget] = []
@@ -270,7 +272,7 @@ def time_budget(ethogram: Ethogram, track_id: Int[np.ndarray, "N"]) -> list[Budg
 
 
 def _interval(seconds: Float[np.ndarray, "N"], seen: Float[np.ndarray, "N"]) -> tuple[float, float]:
-    if len(seconds) < 2 or not seconds.any():
+    if len(seconds) < MIN_BIRDS or not seconds.any():
         return float("nan"), float("nan")
     with np.errstate(all="ignore"):
         found = bootstrap(

@@ -34,7 +34,7 @@ MEANINGS = {
     "Ethogram": "Which bird shows which behaviour when. A frame has one behaviour: the first whose rule holds.",
     "Bout": "A behaviour of one bird from its start to its stop, without interruption.",
     "Time budget": "Time of a behaviour ÷ time with a pose. The 95 % interval is that of the bootstrap over birds. "
-    "Few birds give an interval that is too narrow, and one bird gives none.",
+    "Fewer than eight birds have no interval.",
 }
 """Definitions of the words of the section."""
 

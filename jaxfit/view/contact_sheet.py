@@ -116,7 +116,7 @@ def contact_sheet(
         tiles = []
         for n, t in row:
             ground = None if footage is None else footage.get((n, t))
-            tiles.append(np.hstack([_observed_tile(posed, detected, n, t, ground), _mesh_tile(posed, n, t, colours)]))
+            tiles.append(np.hstack([observed_tile(posed, detected, n, t, ground), _mesh_tile(posed, n, t, colours)]))
         drawn.append(np.hstack(tiles + [blank] * (columns - len(row))))
     flagged = bool(np.isin(flags(solution.flags.doubts), (UNSURE, CONTRADICTED)).any())
     legend = _legend(drawn[0].shape[1], footage is not None, observations is not None, flagged)
@@ -177,7 +177,8 @@ def _to_tile(points_px: np.ndarray, window: np.ndarray) -> np.ndarray:
     return (points_px - window[:2]) * (TILE_PX / window[2])
 
 
-def _observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np.ndarray | None) -> np.ndarray:
+def observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np.ndarray | None) -> np.ndarray:
+    """Return the left tile of a bird in `contact_sheet`."""
     solution, window = posed.solution, _window(posed, n, t)
     tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8) if footage is None else footage.copy()
     mask = detected.mask(n, t) if footage is None else None

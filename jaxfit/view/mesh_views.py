@@ -94,7 +94,7 @@ class SideViews:
             y, x = (i * self.tile_px for i in divmod(n, self.columns))
             tile = strip[y : y + self.tile_px, x : x + self.tile_px]
             if shown[n]:
-                tile[:] = self._bird(n, t, vertices_cam[n])
+                tile[:] = self.bird(n, t, vertices_cam[n])
             else:
                 text(tile, "not here", 0.6 * self.text_px, 3 * self.text_px, self.text_px, (170, 170, 170))
             tile[:, -1:] = (222, 222, 222)
@@ -102,7 +102,8 @@ class SideViews:
             tag(tile, f"track {track}", 0.5 * self.text_px, 1.3 * self.text_px, self.text_px, track_colour(n))
         return strip
 
-    def _bird(self, n: int, t: int, vertices_cam: Float[np.ndarray, "V 3"]) -> UInt8[np.ndarray, "S S 3"]:
+    def bird(self, n: int, t: int, vertices_cam: Float[np.ndarray, "V 3"]) -> UInt8[np.ndarray, "S S 3"]:
+        """Return the tile of one bird, without its number."""
         blank = np.full((self.tile_px, self.tile_px, 3), PAPER, np.uint8)
         offset = (vertices_cam - self._centre_cam[n, t]) @ self._R_view_cam[n, t].T / self.solution.poses.scale[n, t]
         return draw_parallel(blank, offset * self._zoom, self._faces, self._colours[n])

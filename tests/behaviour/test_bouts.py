@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 from support.described import LENGTH_M, STANDING, flock, in_lengths, result, rules, turned
 
 from jaxfit.behaviour.bouts import NO_POSE, OTHER, find_bouts, time_budget
@@ -306,13 +307,16 @@ def test_a_bird_without_a_pose_has_no_share():
     assert all(np.isnan(row.share) for row in budget(np.zeros((0, 5)))[1])
 
 
-def test_the_interval_of_two_birds():
-    """Of two birds that are seen equally long, the bootstrap draws both or one of them twice."""
-    rows, _ = budget([[60, 60, 60, 0, 0, 0, 0, 0, 0, 0], [60] * 8 + [0] * 2])
+def test_fewer_than_eight_birds_have_no_interval():
+    """Eight birds: four stand always, four half of the time. The bootstrap is a binomial distribution."""
+    pitch = [[60] * 10] * 4 + [[60] * 5 + [0] * 5] * 4
+    rows, _ = budget(pitch)
     total = rows[None, "up"]
-    assert (total.share, total.low, total.high) == pytest.approx((0.55, 0.3, 0.8))
+    ends = 0.5 + binom.ppf([0.025, 0.975], 8, 0.5) / 16
+    assert (total.share, total.low, total.high) == pytest.approx((0.75, *ends))
     assert np.isnan(rows[1, "up"].low)
     assert np.isnan(rows[None, "high"].high)  # no bird shows it
+    assert np.isnan(budget(pitch[:7])[0][None, "up"].low)
 
 
 def test_the_interval_of_many_birds():

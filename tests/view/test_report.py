@@ -30,7 +30,7 @@ from jaxfit.model.bird import rest_length
 from jaxfit.view.report.axis import clock, duration
 from jaxfit.view.report.contents import gather, next_steps, warnings_of
 from jaxfit.view.report.curves import line_path, scale_of
-from jaxfit.view.report.page import Measured, page, spread_frames
+from jaxfit.view.report.page import Measured, page
 from jaxfit.view.report.timeline import timeline_of
 from jaxfit.view.report.write import film_address, report_of_result
 
@@ -157,25 +157,23 @@ def test_pictures_show_the_footage_with_the_birds_and_bouts_lead_to_it(drawn):
     behaviour = behaviour_in(solution.track_id, solution.frame_index, np.where(solution.valid, 0, -1))
     root = parsed(report_of_result(folder, video, describe=lambda _: behaviour).read_text("utf-8"))
     images = list(root.iter("img"))
-    assert len(images) == overlays.T
-    for image in images:
+    assert [image.get("alt").split(" in ")[0] for image in images] == ["track 4", "track 11"]
+    for n, image in enumerate(images):
         jpeg = base64.b64decode(image.get("src").removeprefix("data:image/jpeg;base64,"), validate=True)
-        picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-        assert picture.shape[1] == overlays.WIDTH
-        assert np.abs(picture[: overlays.HEIGHT].astype(int) - overlays.GREY).max() > 60  # birds on grey footage
-    assert {"frame 5, 1 bird", "frame 4, 2 birds"} <= {image.get("alt") for image in images}
+        picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int)
+        frames = [int(number) for number in image.get("alt").partition("frames ")[2].split(", ")]
+        assert set(frames) <= set(solution.frame_index[solution.valid[n]].tolist())
+        side = picture.shape[0]
+        assert picture.shape == (side, 8 * side, 3)  # four moments
+        for moment in range(4):
+            film, view = (picture[:, (2 * moment + i) * side : (2 * moment + i + 1) * side] for i in (0, 1))
+            assert (np.abs(film - overlays.GREY).max(-1) < 12).mean() > 0.3  # a bird on grey footage
+            assert np.abs(film - overlays.GREY).max() > 60
+            assert (view.min(-1) > 240).mean() > 0.3  # a bird on paper
+            assert (view.min(-1) < 200).any()
+    assert "Track 11" in text_of(section(root, "Birds"))
     addresses = [each.get("href") for each in root.iter("a")]
     assert [address.partition("#t=")[0] for address in addresses] == ["../film.mp4"] * len(behaviour.ethogram.bouts)
-
-
-def test_frames_with_many_poses_are_chosen():
-    valid = np.zeros((3, 100), bool)
-    valid[0, 10:90] = True
-    valid[1, [12, 40, 77]] = True
-    valid[:, 41] = True
-    assert spread_frames(valid, 4) == [12, 41, 59, 77]
-    assert spread_frames(valid[:, 40:43], 4) == [0, 1, 2]
-    assert spread_frames(np.zeros_like(valid), 4) == []
 
 
 def states(shapes, columns):
@@ -294,16 +292,22 @@ def test_other_files_are_not_replaced_and_wrong_files_are_named(folder, drawn, t
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
 @pytest.mark.parametrize("width", [500, 1280])
 def test_a_browser_draws_the_page(drawn, tmp_path, width):
-    path, shot = report_of_result(*drawn, out=tmp_path / "report.html"), tmp_path / "shot.png"
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},2600", f"--screenshot={shot}"]
+    solution, shot = overlays.solution(), tmp_path / "shot.png"
+    rising = np.arange(overlays.T) * np.ones((2, 1))
+    behaviour = behaviour_in(solution.track_id, solution.frame_index, 0 * rising.astype(int), body_pitch=rising)
+    path = report_of_result(*drawn, out=tmp_path / "report.html", describe=lambda _: behaviour)
+    path.write_text(path.read_text("utf-8").replace("<details>", "<details open>"), "utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width},3600", f"--screenshot={shot}"]
     subprocess.run([BROWSER, *options, path.as_uri()], check=True, capture_output=True, timeout=120)
     image = cv2.imread(str(shot))
     assert image.shape[1] == width
     colours = image.reshape(-1, 3)
     bars = (colours == (0x6B, 0x30, 0x08)).all(1).sum()  # of the timeline: two birds
     assert bars > 2 * 0.5 * (width / 2) * 10
-    footage = (np.abs(colours.astype(int) - overlays.GREY) < 3).all(1).mean()
-    assert footage > 0.05
+    footage = (np.abs(colours.astype(int) - overlays.GREY) < 3).all(1).sum()
+    moments, tile_px = {500: (2, 118), 1280: (4, 138)}[width]  # that fit beside each other, of two birds
+    assert footage > 0.3 * 2 * moments * tile_px**2
+    assert (colours.max(-1) < 8).mean() < 0.002  # curves are lines, and not filled
 
 
 def behaviour_in(track_id, frames, state, notes=(), **values):

@@ -9,29 +9,33 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
 
 from jaxfit.cameras.camera import Camera
 from jaxfit.data.flags import FLAGS
 from jaxfit.data.observations import Observations
+from jaxfit.data.projection import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.foundation.errors import counted
 from jaxfit.model.bird import Bird
-from jaxfit.view.overlay import overlay_pictures
+from jaxfit.video.reader import probe_video, read_frames
+from jaxfit.view.birds import Detected
+from jaxfit.view.contact_sheet import TILE_PX, cut_tiles, observed_tile, sheet_pairs
+from jaxfit.view.mesh_views import SideViews
+from jaxfit.view.overlay import check_belongs, too_short
 from jaxfit.view.report.axis import duration
 from jaxfit.view.report.contents import Report, Track, next_steps, warnings_of
 from jaxfit.view.report.rendering import rendered
 from jaxfit.view.report.timeline import SmallCurve, error_curve, size_curve, timeline_of
 
-_COUNT, _WIDTH_PX, _QUALITY = 6, 960, 80
+_MOMENTS, _MOST, _TILE_PX, _QUALITY = 4, 24, 180, 80
 
 
 class Picture(NamedTuple):
-    """One frame with drawn birds."""
+    """One bird at some moments: the film with the fitted outline, and the bird from its left."""
 
-    frame: int
-    birds: int
-    """Number of birds with a pose."""
+    track_id: int
+    frames: tuple[int, ...]
+    """Numbers of the frames."""
     width: int
     height: int
     jpeg: bytes
@@ -50,7 +54,7 @@ def report_pictures(
     force: bool = False,
     lens: Camera | None = None,
 ) -> list[Picture]:
-    """Draw some frames of a result; with `force`, also on a video that is not the video of the result.
+    """Draw the birds of a result at four moments each; with `force`, also on a video that is not that of the result.
 
     Args:
         solution, bird, video, observations, force, lens: as for `jaxfit.view.overlay.overlay`.
@@ -58,34 +62,35 @@ def report_pictures(
     Raises:
         InputError: as `jaxfit.view.overlay.overlay_frame`.
     """
-    frames = solution.frame_index[spread_frames(solution.valid)].tolist()
+    check_belongs(solution, observations, video, probe_video(video), force)
+    rows, posed, detected = (
+        sheet_pairs(solution, _MOMENTS, _MOST),
+        PosedBirds(solution, bird, lens),
+        Detected(solution, observations),
+    )
+    sides = SideViews(solution, bird, 8 * TILE_PX, 1)
+    tiles: dict[tuple[int, int], np.ndarray] = {}
+    for t in sorted({t for row in rows for _, t in row}):
+        number = int(solution.frame_index[t])
+        found = next(iter(read_frames(video, number, number + 1)), None)
+        if found is None and not force:
+            raise too_short(video, solution, 0)
+        here = [(n, at) for row in rows for n, at in row if at == t] if found is not None else []
+        for cell, film in cut_tiles(posed, found.picture, here).items() if found is not None else ():
+            side = sides.bird(*cell, posed.vertices_cam_window(cell[0], slice(t, t + 1))[0])
+            pair = [observed_tile(posed, detected, *cell, film), side]
+            size = (_TILE_PX, _TILE_PX)
+            tiles[cell] = np.hstack([cv2.resize(tile, size, interpolation=cv2.INTER_AREA) for tile in pair])
     pictures = []
-    for frame, image in overlay_pictures(
-        solution, bird, video, frames, observations=observations, lens=lens, max_width=_WIDTH_PX, force=force
-    ):
-        birds = int(solution.valid[:, int(np.searchsorted(solution.frame_index, frame))].sum())
-        _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-        pictures.append(Picture(frame, birds, image.shape[1], image.shape[0], jpeg.tobytes()))
+    for row in rows:
+        shown = [cell for cell in row if cell in tiles]
+        if shown:
+            image = np.hstack([tiles[cell] for cell in shown])
+            _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+            n, frames = shown[0][0], tuple(int(solution.frame_index[t]) for _, t in shown)
+            height, width = image.shape[:2]
+            pictures.append(Picture(int(solution.track_id[n]), frames, width, height, jpeg.tobytes()))
     return pictures
-
-
-def spread_frames(valid: Bool[np.ndarray, "N T"], count: int = _COUNT) -> list[int]:
-    """Return the positions of some frames, spread over the result.
-
-    The frames with a pose are divided into `count` parts of equal length. The frame with the most poses is chosen from
-    every part; of several such frames, the frame that is nearest to the middle of the part.
-
-    Args:
-        valid: where birds have poses.
-        count: number of frames; fewer frames with a pose are all chosen.
-    """
-    poses = valid.sum(0)
-    chosen = []
-    for part in np.array_split(np.flatnonzero(poses), count):
-        if len(part):
-            from_middle = np.abs(np.arange(len(part)) - (len(part) - 1) / 2)
-            chosen.append(int(part[np.lexsort((from_middle, -poses[part]))[0]]))
-    return chosen
 
 
 _MARKS = {"ok": "✓", "partly diverged": "▲", "diverged": "✕", "no usable frame": "–"}
@@ -188,6 +193,8 @@ def page(
         table_headings=headings,
         table_rows=rows,
         meanings=meanings,
+        titles=dict(meanings),
+        tracks={track.track_id: track for track in report.tracks},
         facts=[*footage, ("result", report.folder), *report.facts.items()],
         behaviour=behaviour,
         section=section,
