@@ -180,7 +180,8 @@ def run_tracking(
     with clock("clean up"):
         names, footage = keypoints.keypoint_names, read_footage(source, reader.info.frames)
         all_tracks = observations_of(records, names, skeleton_pairs(names), reader.info.fps, footage)
-        if getattr(keypoints, "sees_outlines", False):
+        sees_outlines = getattr(keypoints, "sees_outlines", False)
+        if sees_outlines:
             all_tracks = replace(all_tracks, keypoint_origin=np.where(all_tracks.present, FROM_OUTLINE, 0))
         length = all_tracks.present.sum(1)  # frames with a detection of the bird, not the frames in between
         score = np.where(all_tracks.present, np.asarray(all_tracks.score), 0).sum(1) / np.maximum(length, 1)
@@ -195,7 +196,9 @@ def run_tracking(
         np.concatenate([record.segmenter_distance for record in records]).tolist(),
         np.concatenate([record.keypoint_distance for record in records]).tolist(),
     ]
-    trust = judge(footage_signals(all_tracks, short_tracks, distances, getattr(keypoints, "curve", None) is not None))
+    # an outline leaves much open, so the limit for confidences of the built-in network does not hold
+    calibrated = getattr(keypoints, "curve", None) is not None and not sees_outlines
+    trust = judge(footage_signals(all_tracks, short_tracks, distances, calibrated))
     tracking = TrackingResult(observations, short_tracks, low_score_tracks, damaged, None, trust, choice, clock.seconds)
     if observations.num_tracks:
         return tracking

@@ -55,7 +55,9 @@ def test_tracks_are_the_truth(video):
 
 def test_keypoints_of_outlines_say_so(video):
     config = TrackConfig(keypoints=KeypointsConfig(file="outline"), min_track_frames=2)
-    found = run_tracking(video, config, TrueSegmenter(FOOTAGE)).observations
+    tracking = run_tracking(video, config, TrueSegmenter(FOOTAGE))
+    found = tracking.observations
+    assert tracking.trust.signals.confidence is None
     assert found.keypoint_names == AVES_KEYPOINTS
     assert (found.keypoint_origin == FROM_OUTLINE).all()
 
