@@ -232,6 +232,17 @@ def test_the_picture_is_the_frame_of_the_result(browser, tmp_path, clip):
         opened.close()
 
 
+def test_a_slow_browser_that_does_not_say_which_frame_it_shows(browser, result, tmp_path):
+    seen, video = result
+    with served(seen.folder, video) as (client, _):
+        opened = Opened(browser, client.address)
+        opened.page.evaluate("jaxfit.state.film.video.requestVideoFrameCallback = () => 0")
+        opened.go(3)
+        opened.until("jaxfit.state.film.picture instanceof HTMLImageElement")
+        assert opened.page.evaluate("jaxfit.state.film.picture.src").endswith(f"/frames/{overlays.FIRST + 3}")
+        opened.close()
+
+
 def test_a_playing_film_with_gaps_shows_frames_of_the_result_only(browser, tmp_path):
     numbers = range(3, 51, 8)
     (tmp_path / "of").mkdir()

@@ -69,7 +69,7 @@ export class Film {
     return Math.abs(this.times_s[i] - time) <= this.margin || !this.gaps ? i : -1;
   }
 
-  /** Moves the video to a frame; whether the video shows this frame. @param {HTMLVideoElement} video @param {number} i position of the frame */
+  /** Moves the video to a frame; whether the video shows this frame, null if the browser does not say so in time. @param {HTMLVideoElement} video @param {number} i position of the frame */
   async move(video, i) {
     const time = this.times_s[i] + this.margin;
     if (video.readyState >= 2 && Math.abs(video.currentTime - time) < 1e-4) return true;
@@ -81,8 +81,8 @@ export class Film {
     });
     if (video.error) return false; // the film was removed or replaced
     // the picture may come after the event; at a variable rate, browsers may stop at a neighbour of the frame
-    const mediaTime = await Promise.race([shown, new Promise((done) => setTimeout(done, SHOWN_MS, time))]);
-    return Math.abs(mediaTime - time) <= 2 * this.margin;
+    const mediaTime = await Promise.race([shown, new Promise((done) => setTimeout(done, SHOWN_MS, null))]);
+    return mediaTime === null ? null : Math.abs(mediaTime - time) <= 2 * this.margin;
   }
 
   /** Shows a frame; resolves when its picture is there. @param {number} i position of the frame */
@@ -98,7 +98,7 @@ export class Film {
     if (video?.error) this.video = null;
     if (video && (exact || !this.pictures) && !video.error) {
       this.picture = await createImageBitmap(video);
-      this.problem = exact ? "" : "The browser shows a frame of the film beside this one.";
+      this.problem = exact !== false ? "" : "The browser shows a frame of the film beside this one.";
       this.shown.set(i, this.picture);
       const most = Math.max(CACHE_BYTES / (4 * video.videoWidth * video.videoHeight), 2);
       for (const [old, picture] of this.shown) {
