@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from support import corrected, films, overlays
+from support.birds import solution_of
 from support.viewed import served, shown, unpacked, write_result
 
 import jaxfit
@@ -20,11 +21,12 @@ from jaxfit.cli.view import leading_page
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.flags import FLAGS, flags
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.data.solution import load_solution, save_solution
+from jaxfit.data.solution import load_solution, save_solution, select_solution
 from jaxfit.learning.networks.labels import read_labels
 from jaxfit.perception.label_flow import read_few_labels
 from jaxfit.review.edits import read_edits
 from jaxfit.review.suggest import varied_frames
+from jaxfit.simulation.flock import smooth_motion
 from jaxfit.video.reader import read_frames
 from jaxfit.viewer import session
 from jaxfit.viewer.blank import Blank, LabelSession
@@ -238,7 +240,9 @@ def test_a_slow_browser_that_does_not_say_which_frame_it_shows(browser, result, 
         opened = Opened(browser, client.address)
         opened.page.evaluate("jaxfit.state.film.video.requestVideoFrameCallback = () => 0")
         opened.go(3)
-        opened.until("jaxfit.state.film.picture instanceof HTMLImageElement")
+        opened.page.evaluate("jaxfit.refresh()")  # as late outlines do
+        opened.page.wait_for_timeout(100)
+        opened.until("!jaxfit.state.busy && jaxfit.state.film.picture instanceof HTMLImageElement")
         assert opened.page.evaluate("jaxfit.state.film.picture.src").endswith(f"/frames/{overlays.FIRST + 3}")
         opened.close()
 
@@ -604,6 +608,25 @@ def test_two_results_and_no_film(browser, result):
         assert opened.page.locator(".film").count() == 0
         assert "--video" in opened.page.inner_text("#notes")
         opened.until("jaxfit.state.columns.every((column) => column.ledge.ready)")
+        opened.close()
+
+
+def test_sixty_birds_in_one_frame(browser, tmp_path):
+    """A film of one frame; the sixtieth row of the timeline scrolls into view."""
+    crops = np.array([(30 * (n % 10), 20 * (n // 10), 100) for n in range(60)])[:, None]
+    many = solution_of(overlays.BIRD, [smooth_motion(overlays.BIRD, 2, n % 5) for n in range(60)], crops)
+    size_px = np.full((60, 2, 2), [overlays.WIDTH, overlays.HEIGHT])
+    many = many.with_arrays(track_id=np.arange(1, 61), image_size_px=size_px)
+    one = select_solution(many, np.arange(60), np.array([0]))
+    save_solution(one, overlays.BIRD, "base: fast\n", {}, tmp_path / "result")
+    with served(tmp_path / "result", overlays.film(tmp_path / "film.mp4", 1), tmp_path / "x.edits") as (client, _):
+        opened = Opened(browser, client.address, "#birds=59")
+        for key in ("ArrowRight", "n", " ", "ArrowDown"):
+            opened.page.keyboard.press(key)
+        opened.until("!jaxfit.state.playing && !jaxfit.state.busy && jaxfit.state.i === 0")
+        assert opened.selected() == [60]
+        bottom = "(({ scrollTop, clientHeight }) => scrollTop + clientHeight)(jaxfit.state.timeline.parent)"
+        assert opened.page.evaluate(bottom) >= 64 + 16 * 60
         opened.close()
 
 

@@ -42,6 +42,8 @@ export class Film {
     /** @type {CanvasImageSource | null} */
     this.picture = null;
     this.problem = "";
+    /** The last frame that the video was moved to, and whether the video shows it. @type {{i: number, exact: boolean | null} | null} */
+    this.moved = null;
     /** Pictures that were shown last, so that scrubbing to and fro does not wait for the decoder. @type {Map<number, ImageBitmap>} */
     this.shown = new Map();
     this.source = this.times_s.every((time) => time !== null) ? facts.source : null;
@@ -72,7 +74,7 @@ export class Film {
   /** Moves the video to a frame; whether the video shows this frame, null if the browser does not say so in time. @param {HTMLVideoElement} video @param {number} i position of the frame */
   async move(video, i) {
     const time = this.times_s[i] + this.margin;
-    if (video.readyState >= 2 && Math.abs(video.currentTime - time) < 1e-4) return true;
+    if (this.moved?.i === i && Math.abs(video.currentTime - time) < 1e-4) return this.moved.exact;
     const shown = new Promise((done) => video.requestVideoFrameCallback((_, { mediaTime }) => done(mediaTime)));
     await new Promise((done) => {
       video.onseeked = done;
@@ -82,7 +84,9 @@ export class Film {
     if (video.error) return false; // the film was removed or replaced
     // the picture may come after the event; at a variable rate, browsers may stop at a neighbour of the frame
     const mediaTime = await Promise.race([shown, new Promise((done) => setTimeout(done, SHOWN_MS, null))]);
-    return mediaTime === null ? null : Math.abs(mediaTime - time) <= 2 * this.margin;
+    const exact = mediaTime === null ? null : Math.abs(mediaTime - time) <= 2 * this.margin;
+    this.moved = { i, exact };
+    return exact;
   }
 
   /** Shows a frame; resolves when its picture is there. @param {number} i position of the frame */

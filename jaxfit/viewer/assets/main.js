@@ -117,6 +117,7 @@ function select(track, more) {
   if (was && more) state.selected.delete(track);
   else state.selected.add(track);
   state.timeline?.drawStill(state.selected);
+  state.timeline?.reveal(state.timeline.rows.findIndex((row) => row.id === track));
   state.corrections?.show();
   refresh();
 }
@@ -322,6 +323,7 @@ async function play() {
       if (video.ended || shown.mediaTime >= times_s[times_s.length - 1] - 1e-3) pause();
       else video.requestVideoFrameCallback(step);
     };
+    video.onended = () => state.playing && pause(); // no frame may come after the last one
     video.requestVideoFrameCallback(step);
     return;
   }

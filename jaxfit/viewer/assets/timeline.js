@@ -58,6 +58,12 @@ export class Timeline {
     this.still.addEventListener("pointerup", () => { pressed = false; });
   }
 
+  /** Scrolls to a row. @param {number} n */
+  reveal(n) {
+    const top = CURVE + n * ROW, { scrollTop, clientHeight } = this.parent;
+    if (top < scrollTop || top + ROW > scrollTop + clientHeight) this.parent.scrollTop = top - clientHeight / 2;
+  }
+
   /** @param {number} i position of a frame @param {number} width */
   x(i, width) {
     return LABEL + ((width - LABEL) * i) / Math.max(this.frames.length - 1, 1);
