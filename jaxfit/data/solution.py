@@ -156,6 +156,8 @@ class Bodies(_Arrays):
     """Scale of the keypoint errors, as a multiple of the scale in the config."""
     keypoint_offsets: Float32[np.ndarray, "N K 3"]
     """Detected keypoints minus keypoints of the model, in the rest pose, model units: sideways, to the bill, up."""
+    outline_offset: Float32[np.ndarray, "N"]
+    """How far the outlines of masks lie outside the mesh, model units."""
 
 
 def layout_of(record: type) -> dict[str, tuple[str, Any]]:

@@ -159,7 +159,7 @@ def fit_batch(
             used, hyperparameters = own[0], [stage_hyperparameters(*pair, model.bird.keypoint_names) for pair in pairs]
         run = _stage_run(used, with_shared(program, used), rows, hyperparameters, batch, first)
         bars = _error_bars(run, rows, configs[0].common_size, covariance)
-    pose = replace(rows.pose, betas=rows.pose.betas[:, : len(model.rig.shape_basis)])
+    pose = replace(rows.pose, betas=rows.pose.betas[:, : model.rig.num_shapes])
     fitted = FittedWindow(
         pose, final.loss, final.keypoints_cam, final.keypoints_px, rows.failure, rows.ambiguity_deg, bars, body
     )

@@ -34,8 +34,9 @@ one share d for bones and one for shape. The bodies are the means of their joint
 marginal likelihood on a grid. So d = 1 if birds of one species differ as much as any birds, and the bodies then do not
 depend on each other; d is near 0 if all tracks have one body. A track alone has the prior N(0, C) for every d.
 
-Keypoints of a detector lie beside those of the model (`keypoint_offsets`): these offsets are further shape coefficients
-of the fit, which move no vertex, so that I and s are about bodies and offsets. All tracks have the same offsets, with a
+Keypoints of a detector lie beside those of the model (`keypoint_offsets`), and its masks are too large or too small:
+these offsets are further shape coefficients of the fit, of which one moves the mesh along its normals and no keypoint,
+and the others move no vertex. So I and s are about bodies and offsets. All tracks have the same offsets, with a
 prior whose width has the largest marginal likelihood on a grid. For the offsets, a share of the posture that lasts is
 common to all tracks (`COMMON_POSTURE`): s = I·x + U·v + noise, with one v for all tracks.
 
@@ -121,7 +122,8 @@ class Body(NamedTuple):
     """Relative to the rest skeleton."""
     betas: Float[np.ndarray, "S"]
     offsets: Float[np.ndarray, "D"]
-    """Of the keypoints, along `keypoint_offsets.offset_directions`, equal for all birds; D is 0 for fixed offsets."""
+    """Of the outlines of masks, model units, and of the keypoints, along `keypoint_offsets.offset_directions`; equal for
+    all birds. D is 0 for fixed offsets."""
     covariance: Float[np.ndarray, "P P"]
     """Σ of the numbers that the stage optimises: bone lengths, shape coefficients, offsets."""
     frames: float
@@ -210,7 +212,7 @@ def estimate_bodies(
     """
     bird, names = model.bird, _body_numbers(config)
     mean, precision, broad = _prior(model.priors, config)
-    offsets = len(model.rig.keypoint_shape_map) - len(model.rig.shape_basis)
+    offsets = model.rig.of_detector
     P, common_posture = len(mean), COMMON_POSTURE if offsets else 0.0
     postures = 3 * (bird.num_joints - 1) if offsets else 0
     # the numbers of a body, the offsets, and the posture that all birds have in common
@@ -252,9 +254,11 @@ def estimate_bodies(
         group = np.zeros(len(tracks), int) if species is None else species[tracks]
     found = _of_tracks(np.stack(information), np.stack(score), group, prior, is_bone, offsets)
     if offsets:
-        shift = np.tensordot(found[0][0][P - offsets : P], offset_directions(bird), axes=1)
-        share = np.sqrt((shift**2).sum(1).mean()) / longest_distance(bird)
+        outline, *along = found[0][0][P - offsets : P]
+        shift, length = np.tensordot(along, offset_directions(bird), axes=1), longest_distance(bird)
+        share = np.sqrt((shift**2).sum(1).mean()) / length
         _logger.info("the keypoints lie %.1f %% of the length of the bird beside those of the model (RMS)", 100 * share)
+        _logger.info("the outlines of masks lie %+.1f %% of the length of the bird outside the mesh", 100 * outline / length)
     bodies = {}
     of_model = np.asarray(bird.bone_mean, np.float32), np.zeros(bird.num_shapes, np.float32)
     for i, (n, (change, covariance)) in enumerate(zip(tracks.tolist(), found, strict=True)):
@@ -423,14 +427,15 @@ def with_bodies(
     arrays: dict[str, np.ndarray] = {name: np.full((birds, size), np.nan, np.float32) for name, size in sizes.items()}
     directions = offset_directions(bird)
     arrays["keypoint_offsets"] = np.full((birds, bird.num_keypoints, 3), np.nan, np.float32)
-    arrays |= {name: np.full(birds, np.nan, np.float32) for name in ("frames", "determined", "keypoint_scale")}
+    of_track = "frames", "determined", "keypoint_scale", "outline_offset"
+    arrays |= {name: np.full(birds, np.nan, np.float32) for name in of_track}
     for n, body in bodies.items():
         arrays["bone_length"][n], arrays["betas"][n, : len(body.betas)] = body.bone_length, body.betas
         arrays["betas"][n, len(body.betas) :] = 0  # for a fit without shape coefficients
         for name in ("frames", "determined", "keypoint_scale"):
             arrays[name][n] = getattr(body, name)
-        offsets = body.offsets if len(body.offsets) else np.zeros(len(directions))
-        arrays["keypoint_offsets"][n] = np.tensordot(offsets, directions, axes=1)
+        outline, *along = body.offsets if len(body.offsets) else np.zeros(1 + len(directions))
+        arrays["outline_offset"][n], arrays["keypoint_offsets"][n] = outline, np.tensordot(along, directions, axes=1)
         sd = np.sqrt(np.diagonal(body.covariance))[: len(body.covariance) - len(body.offsets)]
         sd = _split(sd, _body_numbers(config), np.zeros(bones), np.zeros(shapes))
         arrays["bone_length_sd"][n], arrays["betas_sd"][n] = sd
@@ -448,8 +453,9 @@ def bodies_of(solution: Solution, bird: Bird, config: FitConfig) -> dict[int, Bo
     directions = offset_directions(bird) if config.learns_offsets else np.zeros((0, bird.num_keypoints, 3))
     of_directions = directions.reshape(len(directions), 3 * bird.num_keypoints).T
     for n in np.flatnonzero(np.isfinite(known.frames)).tolist():
-        sd = np.concatenate([getattr(known, f"{name}_sd")[n] for name in names] + [np.zeros(len(directions))])
-        offsets = np.linalg.lstsq(of_directions, known.keypoint_offsets[n].ravel())[0]
+        along = np.linalg.lstsq(of_directions, known.keypoint_offsets[n].ravel())[0]
+        offsets = np.array([known.outline_offset[n], *along]) if config.learns_offsets else np.zeros(0)
+        sd = np.concatenate([getattr(known, f"{name}_sd")[n] for name in names] + [np.zeros(len(offsets))])
         found[int(solution.track_id[n])] = Body(
             known.bone_length[n],
             known.betas[n],

@@ -173,7 +173,7 @@ def window_error_bars(
     for b, posterior in enumerate(posteriors):
         one, problem, own = jax.tree.map(lambda x, b=b: x[b], (pose, problems, keypoints))
         if isinstance(posterior, str):
-            sizes = one.body_pose.shape[1], len(program.rig.shape_basis), own.points_cam.shape[1]
+            sizes = one.body_pose.shape[1], program.rig.num_shapes, own.points_cam.shape[1]
             bars.append(no_error_bars(len(one.transl), *sizes))
             reasons.append(posterior)
             continue
@@ -222,7 +222,7 @@ def _error_bars(
     """Return the error bars of one window."""
     T, _, _, D = keypoints.derivative.shape
     columns = np.concatenate([window.columns.own, window.columns.shared])
-    bones, shapes = pose.body_pose.shape[1], len(program.rig.shape_basis)
+    bones, shapes = pose.body_pose.shape[1], program.rig.num_shapes
     points, by_cam = np.asarray(keypoints.points_cam, np.float64), np.array(keypoints.derivative, np.float64)
     points_px, by_px = _in_views(program, problem, points, by_cam[..., columns])
     covariance, misfit = _covariance(program, problem, window, points_px, by_px)
@@ -415,7 +415,7 @@ def window_misfits(
         program, problems, pose: as for `window_error_bars`.
         posteriors: of the problems (`posterior.window_posteriors`).
     """
-    free, without_px = len(program.rig.keypoint_shape_map) - len(program.rig.shape_basis), []
+    free, without_px = program.rig.of_detector, []
     keypoints = jax.tree.map(np.asarray, _keypoints_and_derivatives(program, problems, pose))
     problems, factors = jax.tree.map(np.asarray, problems), np.ones(len(posteriors))
     for b, posterior in enumerate(posteriors):

@@ -23,7 +23,7 @@ from jaxfit.fitting.problem import Hyperparameters, Problem, Program, Solver, pr
 from jaxfit.fitting.stored_programs import StoredProgram
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX, CropCamera
-from jaxfit.model.kinematics import Pose, Rig, fold_bird, move_keypoints, with_free_keypoints
+from jaxfit.model.kinematics import Pose, Rig, fold_bird, move_keypoints, with_detector
 from jaxfit.objective.curvature import (
     SHARED_PARAMETERS,
 )
@@ -31,6 +31,7 @@ from jaxfit.objective.objective import evaluate_terms
 from jaxfit.objective.posed_window import Priors, Raster, priors_of
 from jaxfit.objective.registry import find_terms
 from jaxfit.raster.silhouette_reference import Blur
+from jaxfit.raster.zbuffer import vertex_normals
 
 
 class _AdamState(NamedTuple):
@@ -158,8 +159,9 @@ def report(program: Program, problems: Problem, pose: Pose) -> Report:
         window, settings = problem_window(program, problem, pose), problem.hyperparameters.settings
         values = evaluate_terms(window, program.terms, settings)
         weighted = {name: jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()}
-        if (shapes := program.rig.shape_basis.shape[0]) < len(pose.betas):
-            window = problem_window(program, problem, replace(pose, betas=jnp.asarray(pose.betas).at[shapes:].set(0)))
+        if program.rig.of_detector:
+            betas = jnp.asarray(pose.betas).at[program.rig.num_shapes :].set(0)
+            window = problem_window(program, problem, replace(pose, betas=betas))
         return Report(weighted, window.keypoints_cam, window.keypoints_px)
 
     return jax.vmap(one)(problems, pose)
@@ -193,16 +195,15 @@ class FitModel(NamedTuple):
 def fit_model(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None = None) -> FitModel:
     """Return the model of a fit: the bird, folded, with the keypoints of the config, and its crop camera.
 
-    If the config learns `keypoint_offsets` with the bodies, the offsets are the last shape coefficients.
+    If the config learns `keypoint_offsets` with the bodies, the last shape coefficients are those of the detector.
     """
     rig, priors = fold_bird(bird), priors_of(bird)
     if config.keypoint_offsets:
         offsets = [config.keypoint_offsets.get(name, (0.0, 0.0, 0.0)) for name in bird.keypoint_names]
         rig = move_keypoints(rig, np.array(offsets, np.float32))
     if config.learns_offsets:
-        directions = offset_directions(bird)
-        rig = with_free_keypoints(rig, directions)
-        offset_sd = np.full(len(directions), PRIOR_SHARE * longest_distance(bird), np.float32)
+        rig = with_detector(rig, vertex_normals(bird.vertices, bird.faces), offset_directions(bird))
+        offset_sd = np.full(rig.of_detector, PRIOR_SHARE * longest_distance(bird), np.float32)
         priors = priors._replace(shape_sd=jnp.concatenate([priors.shape_sd, offset_sd]))
     return FitModel(bird, rig, priors, crop_camera(config), initial_poses)
 

@@ -71,7 +71,7 @@ class Rig(eqx.Module):
     keypoint_map: Float[Array, "K J 4"]
     """Σ_v keypoint_weights · skin_weights · (v, 1): keypoints as a linear map of the joint transforms."""
     keypoint_shape_map: Float[Array, "S K J 3"]
-    """The same map for each shape direction, and for directions that move keypoints only (`with_free_keypoints`)."""
+    """The same map for each shape direction; the last coefficients may be those of a detector (`with_detector`)."""
     vertices: Float[Array, "3 V"]
     """Rest vertices. V is the last axis here and below, so that products run along contiguous memory."""
     skin_weights: Float[Array, "J V"]
@@ -80,11 +80,18 @@ class Rig(eqx.Module):
     vertex_weights: Float[Array, "V M"]
     """Skinning weights of these joints; 0 for entries that are not used."""
     shape_basis: Float[Array, "S 3 V"]
-    """Coefficients after the first S move keypoints only."""
+    """Further coefficients move keypoints only."""
     faces: Int[Array, "F 3"]
     parents: tuple[int, ...] = eqx.field(static=True)
     joint_names: tuple[str, ...] = eqx.field(static=True)
     keypoint_names: tuple[str, ...] = eqx.field(static=True)
+    of_detector: int = eqx.field(static=True, default=0)
+    """How many of the last coefficients belong to the detector, not to the bird (`with_detector`)."""
+
+    @property
+    def num_shapes(self) -> int:
+        """The number of shape coefficients of the bird."""
+        return len(self.keypoint_shape_map) - self.of_detector
 
 
 def fold_bird(bird: Bird) -> Rig:
@@ -131,16 +138,26 @@ def move_keypoints(rig: Rig, offsets: Float[Array | np.ndarray, "K 3"]) -> Rig:
     return replace(rig, keypoint_map=jnp.concatenate([linear + offsets[:, None] * constant, constant], axis=-1))
 
 
-def with_free_keypoints(rig: Rig, directions: Float[np.ndarray, "D K 3"]) -> Rig:
-    """Return the rig with D further shape coefficients, which move keypoints and not the mesh.
+def with_detector(rig: Rig, normals: Float[np.ndarray, "V 3"], directions: Float[np.ndarray, "D K 3"]) -> Rig:
+    """Return the rig with 1 + D further shape coefficients of a detector.
+
+    The first moves the mesh along its normals and no keypoint: masks that are too large. The others move keypoints and
+    not the mesh.
 
     Args:
         rig: the folded bird.
+        normals: unit normals of the rest vertices.
         directions: movement of the rest positions of the keypoints for a coefficient of 1, model units.
     """
     constant = rig.keypoint_map[..., 3:]  # as for `move_keypoints`
     moved = jnp.asarray(directions, jnp.float32)[:, :, None] * constant
-    return replace(rig, keypoint_shape_map=jnp.concatenate([rig.keypoint_shape_map, moved]))
+    still = jnp.zeros_like(rig.keypoint_map[None, ..., :3])
+    return replace(
+        rig,
+        keypoint_shape_map=jnp.concatenate([rig.keypoint_shape_map, still, moved]),
+        shape_basis=jnp.concatenate([rig.shape_basis, jnp.asarray(normals, jnp.float32).T[None]]),
+        of_detector=1 + len(directions),
+    )
 
 
 def joint_transforms(rig: Rig, pose: Pose) -> Float[Array, "J 3 4"]:

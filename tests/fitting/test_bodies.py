@@ -271,7 +271,7 @@ def test_offsets_are_those_of_all_birds(monkeypatch):
     monkeypatch.setattr(bodies, "WIDTHS", (1.0,))
     config = dataclasses.replace(OFFSETS, learn_weights=("keypoint_offsets",))
     rng, model = np.random.default_rng(8), fit_model(SHAPED, config)
-    D, shapes = len(offset_directions(SHAPED)), SHAPED.num_shapes
+    D, shapes = 1 + len(offset_directions(SHAPED)), SHAPED.num_shapes
     own, P = BONES + shapes, BONES + shapes + D
     prior, symmetric = np.eye(P), np.zeros((P, P))
     prior[:BONES, :BONES], symmetric[:BONES, :BONES] = prior_precision()

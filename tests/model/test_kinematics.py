@@ -18,6 +18,7 @@ from jaxfit.model.kinematics import (
     posed_keypoints,
     posed_vertices,
     rest_pose,
+    with_detector,
 )
 from jaxfit.model.published import import_model
 
@@ -70,6 +71,17 @@ def test_every_shape_direction_changes_the_mesh():
         one = dataclasses.replace(pose, betas=jnp.eye(2)[i])
         for moved, still in zip(posed(RIG, one)[:2], posed(RIG, flat)[:2], strict=True):
             assert np.abs(moved - still).max() > 0.1
+
+
+def test_a_detector_moves_the_outline_or_the_keypoints():
+    rng = np.random.default_rng(2)
+    normals, direction = rng.standard_normal(BIRD.vertices.shape), rng.standard_normal((1, BIRD.num_keypoints, 3))
+    rig, pose = with_detector(RIG, normals, direction), rest_pose(BIRD)
+    assert (rig.of_detector, rig.num_shapes) == (2, BIRD.num_shapes)
+    vertices, keypoints, joints = posed(rig, dataclasses.replace(pose, betas=jnp.array([0.0, 0.0, 0.3, 0.2])))
+    np.testing.assert_allclose(vertices, BIRD.vertices + 0.3 * normals, atol=1e-5)
+    np.testing.assert_allclose(keypoints, BIRD.keypoints + 0.2 * direction[0], atol=1e-5)
+    np.testing.assert_allclose(joints, BIRD.joints, atol=1e-6)
 
 
 def test_rest_pose_gives_the_rest_mesh():
