@@ -122,8 +122,8 @@ class Body(NamedTuple):
     """Relative to the rest skeleton."""
     betas: Float[np.ndarray, "S"]
     offsets: Float[np.ndarray, "D"]
-    """Of the outlines of masks, model units, and of the keypoints, along `keypoint_offsets.offset_directions`; equal for
-    all birds. D is 0 for fixed offsets."""
+    """Of the outlines of masks, model units, and of the keypoints, along `keypoint_offsets.offset_directions`; equal
+    for all birds. D is 0 for fixed offsets."""
     covariance: Float[np.ndarray, "P P"]
     """Σ of the numbers that the stage optimises: bone lengths, shape coefficients, offsets."""
     frames: float
@@ -258,7 +258,9 @@ def estimate_bodies(
         shift, length = np.tensordot(along, offset_directions(bird), axes=1), longest_distance(bird)
         share = np.sqrt((shift**2).sum(1).mean()) / length
         _logger.info("the keypoints lie %.1f %% of the length of the bird beside those of the model (RMS)", 100 * share)
-        _logger.info("the outlines of masks lie %+.1f %% of the length of the bird outside the mesh", 100 * outline / length)
+        _logger.info(
+            "the outlines of masks lie %.1f %% of the length of the bird outside the mesh", 100 * outline / length
+        )
     bodies = {}
     of_model = np.asarray(bird.bone_mean, np.float32), np.zeros(bird.num_shapes, np.float32)
     for i, (n, (change, covariance)) in enumerate(zip(tracks.tolist(), found, strict=True)):

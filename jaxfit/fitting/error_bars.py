@@ -193,7 +193,7 @@ class _Keypoints(NamedTuple):
     """Jr of each rotation."""
 
 
-@functools.partial(StoredProgram, structure=lambda program, problems, pose: _Keypoints(0, 0, 0))
+@functools.partial(StoredProgram, structure=lambda program, problems, pose: _Keypoints._make([0, 0, 0]))
 def _keypoints_and_derivatives(program: Program, problems: Problem, pose: Pose) -> _Keypoints:
     def one(pose: Pose) -> _Keypoints:
         A = window_transforms(program.rig, pose)

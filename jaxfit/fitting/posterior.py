@@ -200,7 +200,7 @@ class Products(NamedTuple):
     """H times `change`."""
 
 
-@functools.partial(StoredProgram, structure=lambda program, problems, pose: Products(0, 0, 0, 0))
+@functools.partial(StoredProgram, structure=lambda program, problems, pose: Products._make([0, 0, 0, 0]))
 def curvature_products(program: Program, problems: Problem, pose: Pose) -> Products:
     """Return the products from which `blocks_of` assembles the curvature of each of B problems."""
 

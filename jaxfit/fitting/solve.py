@@ -150,7 +150,7 @@ class Report(NamedTuple):
 
 
 @functools.partial(
-    StoredProgram, structure=lambda program, problems, pose: Report(dict.fromkeys(program.terms, 0), 0, 0)
+    StoredProgram, structure=lambda program, problems, pose: Report._make((dict.fromkeys(program.terms, 0), 0, 0))
 )
 def report(program: Program, problems: Problem, pose: Pose) -> Report:
     """Evaluate the objective at a batch of poses. A solver's state has only the loss before its last step."""
