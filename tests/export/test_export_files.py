@@ -47,7 +47,7 @@ def test_tables_hold_the_lengths_of_the_bodies(folder, tmp_path):
     arrays = {name: np.zeros((birds, size)) for name, size in sizes.items()}
     arrays |= {"bone_length": np.outer([1, 1.1, np.nan], np.ones(bones)), "keypoint_scale": np.ones(birds)}
     arrays |= {"frames": np.array([5, 5, np.nan]), "determined": np.array([3, 3, np.nan])}
-    arrays |= {"keypoint_offsets": np.zeros((birds, bird.num_keypoints, 3))}
+    arrays |= {"keypoint_offsets": np.zeros((birds, bird.num_keypoints, 3)), "outline_offset": np.zeros(birds)}
     bodies = made.with_arrays(**{f"body_{name}": np.float32(values) for name, values in arrays.items()})
     jaxfit.save_solution(bodies, bird, "", {}, tmp_path / "result")
     jaxfit.export_result(tmp_path / "result", "csv", tmp_path / "birds.csv", metres_per_unit=0.02)

@@ -491,7 +491,8 @@ def test_bodies_are_a_column_in_per_cent_of_the_model(folder):
     arrays = {"bone_length": np.ones((birds, bones)), "bone_length_sd": np.full((birds, bones), 0.01)}
     arrays |= {"betas": np.zeros((birds, shapes)), "betas_sd": np.zeros((birds, shapes))}
     arrays |= {"frames": np.array([5, 5, np.nan]), "determined": np.array([3.0, 0.5, np.nan])}
-    arrays |= {"keypoint_scale": np.ones(birds), "keypoint_offsets": np.zeros((birds, bird.num_keypoints, 3))}
+    arrays |= {"keypoint_scale": np.ones(birds), "outline_offset": np.zeros(birds)}
+    arrays |= {"keypoint_offsets": np.zeros((birds, bird.num_keypoints, 3))}
     made = made.with_arrays(**{f"body_{name}": np.float32(values) for name, values in arrays.items()})
     root = parsed(page(gather(made, None, {}, "", folder, bird), []))
     table = rows_of(section(root, "Quality of each track"))
