@@ -110,6 +110,7 @@ def _levenberg_step(
     loss, new_gradient, blocks = _evaluate(program, problem, new_pose)
     not_finite = ~(jnp.isfinite(state.loss) & jnp.isfinite(state.gradient).all())
     lower = state.prepared & ~not_finite & (loss < state.loss) & jnp.isfinite(new_gradient).all()
+    lower &= jnp.all(new_pose.scale > 0)  # beyond 0, the bird is its mirror image
     # along c the objective is E + g·c + ½κ·c·H·c: solved for κ at the new pose
     bend = jnp.vdot(change, curvature.product(change))
     ratio = 2 * (loss - state.loss - jnp.vdot(gradient, change)) / jnp.where(bend > 0, bend, 1.0)

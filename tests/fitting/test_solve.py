@@ -341,6 +341,18 @@ def test_a_step_that_increases_the_loss_is_not_taken():
     assert not np.any(after.change)
 
 
+def test_a_step_to_a_size_below_0_is_not_taken():
+    """Momentum leads the size below 0; the loss in the state is so large that the step lowers it."""
+    problem = first_problem(PLACE)
+    before, [(_, after)] = take_steps(PLACE, problem, loss=1e30)
+    assert after.loss < before.loss
+    momentum = np.zeros_like(before.change)
+    momentum[:, problem.anchor.body_pose.shape[1] * 3 + 6] = -10
+    _, [(pose, after)] = take_steps(PLACE, problem, loss=1e30, curvature_ratio=0.5, change=momentum)
+    np.testing.assert_array_equal(pose.scale, problem.anchor.scale)
+    assert after.damping == pytest.approx(FIRST_DAMPING * DAMPING_INCREASE)
+
+
 @pytest.mark.parametrize("loss", [np.inf, np.nan])
 def test_a_loss_that_is_not_finite_stops_the_bird(loss):
     """All steps from then on are rejected, so that their number dates the failure."""
