@@ -17,7 +17,7 @@ def bodies_of(bones, betas, bones_sd=0.0, betas_sd=0.0):
     count = len(bones)
     sds = np.full((count, BONES), bones_sd), np.full((count, SHAPES), betas_sd)
     one = np.ones(count)
-    return Bodies(bones, sds[0], betas, sds[1], one, one, one, np.zeros((count, BIRD.num_keypoints, 3)))
+    return Bodies(bones, sds[0], betas, sds[1], one, one, one, np.zeros((count, BIRD.num_keypoints, 3)), one)
 
 
 def posed_length(bones, betas):
