@@ -163,9 +163,12 @@ def carry_labels(
     confidence[~observations.present] = 0
     for problem in problems:
         _logger.warning("%s: %s", source, problem)
-    own = (np.asarray(observations.keypoint_origin) == FROM_OUTLINE) & ~confidence.any(-1)
-    confidence = np.where(own[..., None], observations.confidence, confidence)
-    points = np.where(own[..., None, None], observations.keypoints_px, points)
+    by_outline = np.asarray(observations.keypoint_origin) == FROM_OUTLINE
+    own = by_outline & ~confidence.any(-1)
+    # keypoints that no label is carried to; a person leaves out what cannot be seen
+    missing = (by_outline & (origin != FROM_LABEL))[..., None] & (confidence == 0)
+    confidence = np.where(missing, observations.confidence, confidence)
+    points = np.where(missing[..., None], observations.keypoints_px, points)
     origin = np.where(own, FROM_OUTLINE, np.where(observations.present, origin, 0))
     points = np.where(confidence[..., None] > 0, points, 0)
     changed = replace(observations, occluded=None, keypoint_origin=origin)

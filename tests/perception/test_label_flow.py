@@ -3,6 +3,7 @@
 The oracle is the known motion of the birds.
 """
 
+import dataclasses
 import json
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 
 from jaxfit.data.formats.coco import read_coco, write_coco
 from jaxfit.data.masks import encode_mask
-from jaxfit.data.observations import FROM_FLOW, FROM_LABEL, Observations
+from jaxfit.data.observations import FROM_FLOW, FROM_LABEL, FROM_OUTLINE, Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.perception.label_flow import carry_labels, origin_counts, read_few_labels
 
@@ -129,6 +130,20 @@ def test_a_keypoint_is_hidden_near_labels_that_lack_it(film):
     carried = carry_labels(tracks(masks), labels({(2, 0): where(2), (10, 0): hidden}), folder)
     known = carried.observations.confidence[0, :, 3] > 0
     np.testing.assert_array_equal(known, np.arange(T) <= 6)
+
+
+def test_keypoints_of_the_outline_fill_what_no_label_reaches(film):
+    folder, masks = film
+    hidden = where(10)
+    hidden[3] = np.nan
+    found = tracks(masks)
+    found = dataclasses.replace(found, keypoint_origin=np.full(found.present.shape, FROM_OUTLINE, np.int8))
+    carried = carry_labels(found, labels({(2, 0): where(2), (10, 0): hidden}), folder).observations
+    filled = (np.arange(T) > 6) & (np.arange(T) != 10)  # a label says what can be seen
+    np.testing.assert_array_equal(carried.keypoints_px[0, filled, 3], found.keypoints_px[0, filled, 3])
+    assert (carried.confidence[0, filled, 3] > 0).all()
+    assert carried.confidence[0, 10, 3] == 0
+    assert carried.keypoint_origin[0, 8] == FROM_FLOW
 
 
 @pytest.mark.parametrize("wrong", [lambda: where(6)[::-1], lambda: where(9)])  # exchanged names; another frame's
