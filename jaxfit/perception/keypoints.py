@@ -115,9 +115,7 @@ def crop_bird(
     part = frame[rows, columns]
     picture = np.zeros((crop.height, crop.width, 3), np.uint8)
     picture[inside] = cv2.bitwise_and(part, part, mask=visible[inside])
-    is_reduction = crop.width >= size_px[0] and crop.height >= size_px[1]
-    # when it enlarges, OpenCV's area mode shifts the pixel centres
-    return cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA if is_reduction else cv2.INTER_LINEAR), crop
+    return _resized(picture, size_px), crop
 
 
 def crop_outline(
@@ -139,8 +137,14 @@ def crop_outline(
     outside = np.ones_like(own)
     outside[max(-crop.y0, 0) : max(shape[0] - crop.y0, 0), max(-crop.x0, 0) : max(shape[1] - crop.x0, 0)] = 0
     picture = 255 * np.stack([own, others, outside], axis=-1)
-    is_reduction = crop.width >= size_px[0] and crop.height >= size_px[1]
-    return cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA if is_reduction else cv2.INTER_LINEAR), crop
+    return _resized(picture, size_px), crop
+
+
+def _resized(picture: UInt8[np.ndarray, "H W 3"], size_px: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a picture in another width and height."""
+    is_reduction = picture.shape[1] >= size_px[0] and picture.shape[0] >= size_px[1]
+    # when it enlarges, OpenCV's area mode shifts the pixel centres
+    return cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA if is_reduction else cv2.INTER_LINEAR)
 
 
 def _mask_in(crop: Crop, birds: Sequence[Instance]) -> UInt8[np.ndarray, "h w"]:
@@ -348,10 +352,12 @@ def with_outline_keypoints(observations: Observations) -> Observations:
         observations: masks of birds; keypoints that a model with three or more keypoints of the network has. Other
             observations do not change.
     """
+    alone = observations.present & ~observations.confidence.any(-1)
+    if not alone.any():
+        return observations
     detector = load_keypoint_detector(OUTLINE)
     names = propose_names(detector.keypoint_names, observations.keypoint_names)
-    alone = observations.present & ~observations.confidence.any(-1)
-    if len(names.mapped) < MIN_KEYPOINTS or not alone.any():
+    if len(names.mapped) < MIN_KEYPOINTS:
         return observations
     shape = (*observations.present.shape, len(detector.keypoint_names))
     points_px, confidence = np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32)

@@ -372,11 +372,8 @@ def varied_frames(video: Path, count: int, progress: ProgressTask = silent) -> n
     if total is None:
         total = sum(1 for _ in read_frames(video))
     _check_count(count, total, video)
-    candidates, numbers, thumbnails = (
-        np.linspace(0, total - 1, min(total, SHORTLIST * count)).round().astype(int),
-        [],
-        [],
-    )
+    candidates = np.linspace(0, total - 1, min(total, SHORTLIST * count)).round().astype(int)
+    numbers, thumbnails = [], []
     with progress("Choosing frames", len(candidates)) as report_progress:
         for number in candidates.tolist():
             for frame in read_frames(video, number, number + 1):

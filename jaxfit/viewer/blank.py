@@ -106,7 +106,7 @@ class LabelSession(Session):
 
     Args:
         blank: the frames.
-        labels_path: COCO file of the labels; the edits, from which the page continues, lie beside it.
+        labels_path: COCO file of the labels. The page continues from the file of the edits in the same folder.
 
     Raises:
         InputError: the file of the edits cannot be read.

@@ -93,6 +93,8 @@ class Report:
     facts: Mapping[str, str]
     """Model, networks and versions."""
     corrections: tuple[str, ...]
+    on_labels: bool
+    """Whether poses stand on labels, which optical flow carries."""
     label_problems: tuple[str, ...]
     """Labels that are left out or contradict each other."""
     config: str
@@ -223,6 +225,7 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
         "seconds": {name: float(seconds) for name, seconds in entries("seconds")},
         "facts": facts,
         "corrections": tuple(map(str, summary.get("corrections") or ())),
+        "on_labels": bool(entries("pose_sources")),
         "label_problems": tuple(map(str, (summary.get("labels") or {}).get("problems") or ())),
     }
 
@@ -378,11 +381,10 @@ def next_steps(report: Report) -> list[Step]:
         "and each bird must keep its track number. This command draws the video again:"
     )
     steps = [Step(text, draw)]
-    on_labels = any(name.startswith("poses of track ") for name in report.facts)
-    if report.trust == "low" or on_labels:
+    if report.trust == "low" or report.on_labels:
         text = (
             "Mark the keypoints in further frames in which the overlay is wrong, and add them to your labels:"
-            if on_labels
+            if report.on_labels
             else "The built-in networks may not know this bird. Mark its keypoints in three to ten frames; nothing is "
             "trained. The guide “Other birds” says how."
         )

@@ -63,20 +63,19 @@ def report_pictures(
         InputError: as `jaxfit.view.overlay.overlay_frame`.
     """
     check_belongs(solution, observations, video, probe_video(video), force)
-    rows, posed, detected = (
-        sheet_pairs(solution, _MOMENTS, _MOST),
-        PosedBirds(solution, bird, lens),
-        Detected(solution, observations),
-    )
+    rows = sheet_pairs(solution, _MOMENTS, _MOST)
+    posed, detected = PosedBirds(solution, bird, lens), Detected(solution, observations)
     sides = SideViews(solution, bird, 8 * TILE_PX, 1)
     tiles: dict[tuple[int, int], np.ndarray] = {}
     for t in sorted({t for row in rows for _, t in row}):
         number = int(solution.frame_index[t])
         found = next(iter(read_frames(video, number, number + 1)), None)
-        if found is None and not force:
+        if found is None:
+            if force:
+                continue
             raise too_short(video, solution, 0)
-        here = [(n, at) for row in rows for n, at in row if at == t] if found is not None else []
-        for cell, film in cut_tiles(posed, found.picture, here).items() if found is not None else ():
+        here = [(n, at) for row in rows for n, at in row if at == t]
+        for cell, film in cut_tiles(posed, found.picture, here).items():
             side = sides.bird(*cell, posed.vertices_cam_window(cell[0], slice(t, t + 1))[0])
             pair = [observed_tile(posed, detected, *cell, film), side]
             size = (_TILE_PX, _TILE_PX)
