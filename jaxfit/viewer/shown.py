@@ -16,9 +16,9 @@ from jaxfit.behaviour.birds import Flock, flock_of
 from jaxfit.behaviour.describe import describe
 from jaxfit.behaviour.registry import find_feature, own_features
 from jaxfit.cameras.files import read_cameras
-from jaxfit.data.flags import FLAGS, flags, keypoint_distances
+from jaxfit.data.flags import FLAGS, flags
 from jaxfit.data.keypoint_names import opposite_keypoints
-from jaxfit.data.observations import Observations, mean_confidence
+from jaxfit.data.observations import Observations
 from jaxfit.data.projection import PosedBirds, image_focal_px, in_image
 from jaxfit.data.result_folder import CAMERAS
 from jaxfit.data.solution import select_solution
@@ -273,24 +273,15 @@ class Shown:
         return pack({"values": self._values_of(name).astype(np.float32)})
 
     def _values_of(self, name: str) -> np.ndarray:
-        s, seen = self.solution, self.observations
         if name not in OWN_VALUES:
             with self._lock:
                 found = describe(self.flock, own=[find_feature(name)], deviations=False)
             if name in found.missing:
                 raise InputError(name.replace("_", " "), f"is not known: {found.missing[name]}", "choose another value")
             return found.values[name]
-        if seen is None:
+        if self.observations is None:
             raise InputError(name, "needs the detections, which this result does not hold", "give --observations")
-        values = np.full(s.valid.shape, np.nan)
-        rows = np.intersect1d(seen.track_id, s.track_id, return_indices=True)[1:]
-        columns = np.intersect1d(seen.frame_index, s.frame_index, return_indices=True)[1:]
-        if name == "confidence":
-            found_here = np.where(seen.present, mean_confidence(seen.confidence), np.nan)
-        else:
-            found_here = keypoint_distances(seen, s)
-        values[np.ix_(rows[1], columns[1])] = found_here[np.ix_(rows[0], columns[0])]
-        return np.where(s.valid, values, np.nan)
+        return self._why.compared[name]
 
 
 def mesh_arrays(bird: Bird) -> dict[str, np.ndarray]:

@@ -9,20 +9,20 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit.cameras.camera import Camera
-from jaxfit.data.flags import DOUBTS, expected_error, flags
+from jaxfit.data.flags import DOUBTS, expected_error, flags, keypoint_distances
 from jaxfit.data.mask_comparison import compare_masks
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import positions_in
 from jaxfit.foundation.progress import silent
 from jaxfit.model.bird import Bird
 
 USUAL_POSES = 100
-"""Poses, evenly spaced over the result, whose median is the usual value."""
+"""Poses, evenly spaced over the result, whose median is the usual IoU and the usual distance of one keypoint."""
 
 
 class Measures(NamedTuple):
-    """How poses compare with their detections; NaN where nothing is known."""
+    """How single poses compare with their detections; NaN where nothing is known."""
 
     distance: Float[np.ndarray, "M K"]
     """Distance of each keypoint of the pose from its detection, as a share of the longer side of the box."""
@@ -32,12 +32,6 @@ class Measures(NamedTuple):
     """Longer side of the box."""
     iou: Float[np.ndarray, "M"]
     """IoU of mesh and mask."""
-
-    @property
-    def mean_distance(self) -> Float[np.ndarray, "M"]:
-        """Mean distance, weighted by confidence."""
-        with np.errstate(invalid="ignore"):
-            return np.nansum(self.distance * self.confidence, axis=-1) / self.confidence.sum(-1)
 
 
 class Why:
@@ -52,6 +46,25 @@ class Why:
     def __init__(self, solution: Solution, bird: Bird, observations: Observations | None, lens: Camera | None):
         self._solution, self._bird, self._seen, self._lens = solution, bird, observations, lens
         self._error = expected_error(solution, bird)
+        if observations is not None:
+            # positions in the observations; the last one, which is not known, stands for −1
+            rows, columns = (
+                positions_in(getattr(solution, name), getattr(observations, name))
+                for name in ("track_id", "frame_index")
+            )
+            self._at = rows[:, None], columns
+            self._known = (rows >= 0)[:, None] & (columns >= 0) & observations.present[self._at]
+
+    @cached_property
+    def compared(self) -> dict[str, Float[np.ndarray, "N T"]]:
+        """Distance of the keypoints from the detections (`residual`) and their confidence, by which poses are flagged.
+
+        NaN where a pose has no detection. Needs observations.
+        """
+        seen = self._seen
+        assert seen is not None
+        values = {"residual": keypoint_distances(seen, self._solution), "confidence": mean_confidence(seen.confidence)}
+        return {name: np.where(self._known & self._solution.valid, of[self._at], np.nan) for name, of in values.items()}
 
     def entries(self, n: int, t: int) -> dict[str, Any]:
         """Return the flag of a pose, its doubts, measures, and the detected keypoints from the worst to the best.
@@ -72,11 +85,10 @@ class Why:
 
         if self._seen is not None:
             here, usual = self._measure(np.array([[n, t]])), self._usual
-            detected = usual.confidence.any(axis=0) | here.confidence.any(axis=0)
-            confidence, usual_confidence = (_median(each.confidence[:, detected].mean(-1)) for each in (here, usual))
-            add("Keypoints off, of the box", here.mean_distance[0], _median(usual.mean_distance), "{:.1%}", 0)
+            residual, confidence = self.compared["residual"], self.compared["confidence"]
+            add("Keypoints off, of the box", residual[n, t], _median(residual), "{:.1%}", 0)
             add("Outline agreement (IoU)", here.iou[0], _median(usual.iou), "{:.0%}", 1)
-            add("Confidence", confidence, usual_confidence, "{:.2f}", 4)
+            add("Confidence", confidence[n, t], _median(confidence), "{:.2f}", 4)
             distance_px = here.distance[0] * here.side_px[0]
             found = np.flatnonzero(here.confidence[0] > 0)
             for k in found[np.argsort(-(distance_px * here.confidence[0])[found], kind="stable")].tolist():
@@ -107,12 +119,8 @@ class Why:
         s, seen = self._solution, self._seen
         assert seen is not None
         order = [seen.keypoint_names.index(name) for name in s.keypoint_names]
-        tracks = {int(track): row for row, track in enumerate(seen.track_id)}
-        rows = np.array([tracks.get(int(track), -1) for track in s.track_id])
-        columns = positions_in(s.frame_index, seen.frame_index)
         n, t = cells.T
-        row, column = rows[n], columns[t]
-        known = (row >= 0) & (column >= 0) & seen.present[row, column]
+        row, column, known = self._at[0][n, 0], self._at[1][t], self._known[n, t]
         confidence = np.where(known[:, None], seen.confidence[row, column][:, order], 0).astype(np.float64)
         offset = seen.keypoints_px[row, column][:, order] - s.keypoints.px[n, t]
         side = np.where(known, seen.box_px[row, column, 2:].max(-1), np.nan)
@@ -123,7 +131,7 @@ class Why:
         if self._lens is None and has_mask.any():
             measured = np.zeros(s.valid.shape, bool)
             measured[n[has_mask], t[has_mask]] = True
-            iou = compare_masks(s, self._bird, seen, measured, (rows[:, None], columns), silent).iou[n, t]
+            iou = compare_masks(s, self._bird, seen, measured, self._at, silent).iou[n, t]
         return Measures(distance, confidence, side, iou)
 
 

@@ -10,7 +10,7 @@ from support import overlays
 from support.birds import error_bars
 from support.viewed import shown, unpacked, write_result
 
-from jaxfit.data.flags import flags
+from jaxfit.data.flags import flags, keypoint_distances
 from jaxfit.data.formats.coco import read_coco, write_coco
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.projection import PosedBirds
@@ -152,6 +152,16 @@ def test_why_names_the_wrong_keypoint_and_what_is_usual(tmp_path):
     assert measures["Keypoints off, of the box"] == {
         "title": "Keypoints off, of the box", "here": f"{share:.1%}", "usual": "0.0%", "bad": True,
     }  # fmt: skip
+    # the flag counts a distance of half a box at most, so that one keypoint does not condemn a pose
+    points[n, t, k] += 1000
+    write_coco(seen.with_keypoints(points, seen.confidence), folder / "observations.json")
+    far = shown(folder)
+    why = unpacked(far.why(n * overlays.T + t))[0]
+    assert why["keypoints"][0]["px"] > 1000
+    expected = keypoint_distances(far.observations, far.solution)[n, t]
+    assert expected == pytest.approx(0.5 * weights[k] / weights.sum(), abs=1e-3)
+    assert why["measures"][0]["here"] == f"{expected:.1%}"
+    assert unpacked(far.values("residual"))[1]["values"][n, t] == np.float32(expected)
     assert unpacked(found.why(overlays.T + 2))[0]["flag"] == "no pose"
     with pytest.raises(InputError, match="pose 12"):
         found.why(12)
