@@ -26,7 +26,7 @@ from jaxfit.behaviour.rules import BehaviourConfig
 from jaxfit.cli.arguments import Parser
 from jaxfit.cli.parser import COMMANDS
 from jaxfit.config.build import field_help
-from jaxfit.config.fit import FitConfig
+from jaxfit.config.fit import FitConfig, describe_fit_configs
 from jaxfit.config.reconstruct import ReconstructConfig
 from jaxfit.evaluation.ablation.grid import GridConfig
 
@@ -252,7 +252,14 @@ def messages() -> str:
     return "\n".join(lines)
 
 
-GENERATED = {"commands": commands, "keys": keys, "api": api, "messages": messages}
+def configs() -> str:
+    """Return the table of the configs of fits, as `jaxfit config list` prints them."""
+    lines = ["| | config | for | chosen on |", "| --- | --- | --- | --- |"]
+    lines += [f"| {c.group} | `{c.name}` | {_cell(c.purpose)} | {_cell(c.chosen_on)} |" for c in describe_fit_configs()]
+    return "\n".join(lines) + "\n"
+
+
+GENERATED = {"commands": commands, "keys": keys, "api": api, "messages": messages, "configs": configs}
 
 
 def equation(source: str, language: str, css_class: str, options: Any, markdown: Any, **others: Any) -> str:

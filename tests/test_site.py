@@ -16,6 +16,7 @@ import yaml
 import jaxfit
 from jaxfit.cli.parser import build_parser
 from jaxfit.config.build import plain_config
+from jaxfit.config.fit import describe_fit_configs
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.objective.registry import known_terms
 
@@ -90,6 +91,11 @@ def test_every_key_has_a_description(site):
         lacking = [path for path, _, _, text in site.config_keys(kind) if not text]
         assert not lacking
         assert dataclasses.is_dataclass(kind)
+
+
+def test_the_page_of_configs_has_every_config(site):
+    for config in describe_fit_configs():
+        assert f"| {config.group} | `{config.name}` | {config.purpose[:20]}" in site.configs()
 
 
 def test_the_page_of_python_has_every_public_name(site):
