@@ -124,4 +124,4 @@ class TrackConfig:
     """Tracks with a lower mean score are skipped; null uses the value in the file of the segmenter (0.65 for the
     built-in segmenter), or 0."""
     threads: PositiveInt | None = None
-    """Number of CPU cores for each of the two networks, which run at the same time; null uses all cores."""
+    """Number of frames on which the networks run at the same time, at most 8; null uses the number of CPU cores."""

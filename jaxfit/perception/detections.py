@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Generator, Iterator, Sequence
+import os
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -24,13 +26,16 @@ from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
 from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
 from jaxfit.perception.tracking import RecordedFrame, Tracker, record_frame
 from jaxfit.video.decoding import Frame
-from jaxfit.video.reader import FrameReader, ahead
+from jaxfit.video.reader import FrameReader
 
 _logger = logging.getLogger(__name__)
 
+A = TypeVar("A")
+B = TypeVar("B")
+
 
 def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segmenter:
-    """Load the segmenter of a config.
+    """Load the segmenter of a config. A run uses one thread, so the result does not depend on the number of cores.
 
     Args:
         config: the whole config of tracking. `auto` is the built-in segmenter here
@@ -50,7 +55,7 @@ def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segme
         min_score=settings.min_score if min_score is None else min_score,
         tile_px=settings.tile_px,
         tile_overlap=settings.tile_overlap,
-        threads=config.threads,
+        threads=1,
     )
 
 
@@ -64,7 +69,7 @@ def check_segmenter(config: TrackConfig) -> None:
 
 
 def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
-    """Load the keypoint detector of a config.
+    """Load the keypoint detector of a config. A run uses one thread, as in `open_segmenter`.
 
     Raises:
         InputError: the keypoint detector cannot be used.
@@ -78,7 +83,7 @@ def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
         dilate_px=settings.dilate_px,
         background=settings.background,
         batch=settings.batch,
-        threads=config.threads,
+        threads=1,
     )
 
 
@@ -124,60 +129,79 @@ class FrameDetections(NamedTuple):
     instances: list[Instance]
     distance: Float[np.ndarray, "_"]
     """Distances of the activations of the segmenter; empty for a network without statistics."""
-    keypoints: Callable[[], FrameKeypoints]
-    """Function that returns the keypoints of all instances."""
+    keypoints: FrameKeypoints
+    """The keypoints of all instances, because crops also hide birds without a track."""
     picture: UInt8[np.ndarray, "H W 3"] | None
     """None where another process has read the picture."""
 
 
+MAX_FRAMES_AT_ONCE = 8
+"""Largest number of frames on which the networks run at the same time, to bound the memory."""
+
+
+def frames_at_once(config: TrackConfig) -> int:
+    """Return the number of frames on which the networks run at the same time: one for each core."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(config.threads or cores or 1, MAX_FRAMES_AT_ONCE)
+
+
+def in_threads(function: Callable[[A], B], items: Iterable[A], at_once: int) -> Generator[B]:
+    """Yield the results of all items in their order; threads compute `at_once` results at the same time."""
+    waiting: deque[Future[B]] = deque()
+    with ThreadPoolExecutor(at_once, "detect") as pool:
+        try:
+            for item in items:
+                if len(waiting) == at_once:
+                    yield waiting.popleft().result()
+                waiting.append(pool.submit(function, item))
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
 def detect(
-    reader: FrameReader, segmenter: Segmenter, keypoints: KeypointDetector, clock: Clock
+    reader: FrameReader, segmenter: Segmenter, keypoints: KeypointDetector, clock: Clock, at_once: int = 1
 ) -> Generator[FrameDetections | int]:
     """Yield the detections of every frame, by networks in this process; for a damaged frame, yield only its number.
 
-    A thread runs the segmenter on the next frames.
+    Threads run the networks on the next frames.
 
     Args:
         reader: the frames.
-        segmenter, keypoints: the networks.
-        clock: measures the parts of the work.
+        segmenter, keypoints: the networks; several threads call them if `at_once` is above 1.
+        clock: measures the time until the detections of a frame are complete.
+        at_once: number of frames on which the networks run at the same time.
     """
     for network in (segmenter, keypoints):
-        _take_distances(network)  # those of an earlier video
+        take_distances(network)  # those of an earlier video
 
-    def segmented(stopped: Callable[[], bool]) -> Generator[tuple[Frame, list[Instance], np.ndarray] | int]:
+    def items() -> Generator[Frame | int]:
         seen = 0
         for frame in reader:
-            if stopped():
-                return
             yield from reader.damaged[seen:]
             seen = len(reader.damaged)
-            yield frame, segmenter(frame.picture), _take_distances(segmenter)
+            yield frame
         yield from reader.damaged[seen:]
 
-    def keypoints_of(picture: np.ndarray, instances: Sequence[Instance]) -> FrameKeypoints:
-        with clock("keypoints"):
-            return FrameKeypoints(*keypoints(picture, instances), _take_distances(keypoints))
+    def detected(item: Frame | int) -> FrameDetections | int:
+        if isinstance(item, int):
+            return item
+        number, picture, time_s = item
+        instances = segmenter(picture)
+        distance = take_distances(segmenter)
+        of_birds = FrameKeypoints(*keypoints(picture, instances), take_distances(keypoints))
+        size_px = (picture.shape[1], picture.shape[0])
+        return FrameDetections(number, time_s, size_px, instances, distance, of_birds, picture)
 
-    with single_opencv_thread(), closing(ahead(segmented, SEGMENTED_AHEAD)) as frames:
-        for item in clock.each("detect", frames):
-            if isinstance(item, int):
-                yield item
-                continue
-            (number, picture, time_s), instances, distance = item
-            size_px = (picture.shape[1], picture.shape[0])
-            of_frame = partial(keypoints_of, picture, instances)
-            yield FrameDetections(number, time_s, size_px, instances, distance, of_frame, picture)
+    with single_opencv_thread(), closing(in_threads(detected, items(), at_once)) as results:
+        yield from clock.each("detect", results)
 
 
-def _take_distances(network: object) -> np.ndarray:
-    """Return the distances of the activations of a network since the last call; empty without statistics."""
+def take_distances(network: object) -> np.ndarray:
+    """Return the distances of the activations of a network since the last call of this thread; empty without any."""
     monitor = getattr(network, "activations", None)
     return np.zeros(0) if monitor is None else np.asarray(monitor.take())
-
-
-SEGMENTED_AHEAD = 1
-"""Segmented frames that wait; more do not make tracking faster, because the segmenter takes most of the time."""
 
 
 @contextmanager
@@ -379,7 +403,6 @@ def tracked_frames(
                 continue
             with clock("track"):
                 identities = tracker.update(detected.frame_index, detected.instances, detected.picture)
-            keypoints = detected.keypoints()  # of all birds, because crops also hide birds without a track
             with clock("record"):
                 frame = record_frame(
                     detected.frame_index,
@@ -387,10 +410,10 @@ def tracked_frames(
                     detected.size_px,
                     detected.instances,
                     identities,
-                    keypoints.positions_px,
-                    keypoints.confidence,
+                    detected.keypoints.positions_px,
+                    detected.keypoints.confidence,
                     detected.time_s,
-                    distances=(detected.distance, keypoints.distance),
+                    distances=(detected.distance, detected.keypoints.distance),
                 )
                 unstored.append(frame)
                 has_frames = True

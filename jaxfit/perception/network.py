@@ -17,6 +17,7 @@ from __future__ import annotations
 import base64
 import mmap
 import re
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -264,8 +265,8 @@ class ActivationStatistics(NamedTuple):
         return {MEAN_KEY: _encode(self.mean), WHITENING_KEY: _encode(self.whitening)}
 
 
-class ActivationMonitor:
-    """Collects the distances of the inputs of a network.
+class ActivationMonitor(threading.local):
+    """Collects the distances of the inputs of a network, for every thread that runs the network separately.
 
     Args:
         model: the network, for messages.
@@ -286,7 +287,7 @@ class ActivationMonitor:
         self._distances.append(self._statistics.distance(outputs[OUTPUT][:count]))
 
     def take(self) -> Float[np.ndarray, "N"]:
-        """Return the distances since the last call, in the order of the inputs."""
+        """Return the distances since the last call of this thread, in the order of the inputs."""
         taken, self._distances = self._distances, []
         return np.concatenate([np.zeros(0), *taken])
 

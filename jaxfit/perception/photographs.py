@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,14 @@ from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import Clock, ProgressTask, silent
 from jaxfit.model.anatomy import skeleton_pairs
-from jaxfit.perception.detections import open_keypoint_detector, open_segmenter, single_opencv_thread
+from jaxfit.perception.detections import (
+    frames_at_once,
+    in_threads,
+    open_keypoint_detector,
+    open_segmenter,
+    single_opencv_thread,
+    take_distances,
+)
 from jaxfit.perception.segmenter_choice import FRAMES, with_chosen_segmenter
 from jaxfit.perception.track import TrackingResult
 from jaxfit.perception.tracking import RecordedFrame, record_frame
@@ -55,25 +63,39 @@ def track_photographs(
     segment = getattr(segmenter, "photograph", segmenter)
     records: list[RecordedFrame] = []
     damaged = []
-    with single_opencv_thread(), progress("Photographs", len(files)) as report_progress:
-        for number, file in files.items():
-            picture = read_picture(file)
-            if picture is None:
-                damaged.append(number)
+
+    def record(item: tuple[int, Path]) -> RecordedFrame | int:
+        number, file = item
+        picture = read_picture(file)
+        if picture is None:
+            return number
+        birds = segment(picture)
+        positions_px, confidence = keypoints(picture, birds)
+        size_px, identities = (picture.shape[1], picture.shape[0]), list(range(1, len(birds) + 1))
+        distances = take_distances(segmenter), take_distances(keypoints)
+        return record_frame(
+            number, file.name, size_px, birds, identities, positions_px, confidence, distances=distances
+        )
+
+    with (
+        single_opencv_thread(),
+        progress("Photographs", len(files)) as report_progress,
+        closing(in_threads(record, files.items(), frames_at_once(config))) as results,
+    ):
+        for item in clock.each("detect", results):
+            if isinstance(item, int):
+                damaged.append(item)
                 continue
-            with clock("detect"):
-                birds = segment(picture)
-            with clock("keypoints"):
-                positions_px, confidence = keypoints(picture, birds)
-            size_px, identities = (picture.shape[1], picture.shape[0]), list(range(1, len(birds) + 1))
-            records.append(record_frame(number, file.name, size_px, birds, identities, positions_px, confidence))
-            report_progress(1, f"{file.name}, {counted(len(birds), 'bird')}")
+            records.append(item)
+            report_progress(1, f"{item.file_name}, {counted(len(item.score), 'bird')}")
     empty = [record.file_name for record in records if not len(record.score)]
     if empty:
         _logger.warning("no bird in %s", ", ".join([*empty[:10], *(["…"] if len(empty) > 10 else [])]))
     observations = _observations(records, keypoints.keypoint_names)
-    monitors = [getattr(network, "activations", None) for network in (segmenter, keypoints)]
-    distances = [() if monitor is None else monitor.take().tolist() for monitor in monitors]
+    distances = [
+        np.concatenate([np.zeros(0), *(getattr(record, name) for record in records)]).tolist()
+        for name in ("segmenter_distance", "keypoint_distance")
+    ]
     signals = footage_signals(observations, {}, distances, getattr(keypoints, "curve", None) is not None)
     failure = None
     if not observations.num_tracks:

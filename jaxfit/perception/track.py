@@ -26,11 +26,13 @@ from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.perception.detections import (
     detect,
     expected_frames,
+    frames_at_once,
     load_stored_frames,
     open_keypoint_detector,
     open_segmenter,
     tracked_frames,
 )
+from jaxfit.perception.keypoints import OnnxKeypoints
 from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segmenter
 from jaxfit.perception.tracking import (
@@ -90,7 +92,7 @@ def track_video(
     Args:
         source: a video, or a folder of frames.
         config: frames, networks and tracker.
-        segmenter: replaces the segmenter of `config`; a thread calls the segmenter on the next frames.
+        segmenter: replaces the segmenter of `config`; a thread calls it and the keypoint detector on the next frames.
         keypoints: replaces the keypoint detector of `config`.
         tracker: replaces the tracker of `config`; it must be new.
         progress: reports every frame.
@@ -157,7 +159,8 @@ def run_tracking(
         detections = detect_on_workers(cluster, reader.path, config, range(start, end, frames.step), clock)
     else:
         remaining = reader if start == frames.start else read_frames(source, start, frames.stop, frames.step)
-        detections = detect(remaining, segmenter, keypoints, clock)
+        is_own = has_own_segmenter or not isinstance(keypoints, OnnxKeypoints)  # several threads may not call these
+        detections = detect(remaining, segmenter, keypoints, clock, 1 if is_own else frames_at_once(config))
     num_keypoints, name = len(keypoints.keypoint_names), reader.path.name
     tracked = tracked_frames(detections, stored.tracker, num_keypoints, name, clock, parts)
     with progress("Tracking", total) as report_progress, closing(tracked):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import platform
 from collections.abc import Generator, Iterator
 from dataclasses import replace
@@ -20,6 +19,7 @@ from jaxfit.foundation.workers import Cluster, FailedTask
 from jaxfit.perception.detections import (
     FrameDetections,
     detect,
+    frames_at_once,
     network_files,
     open_keypoint_detector,
     open_segmenter,
@@ -49,7 +49,7 @@ class DetectedFrame(NamedTuple):
     """The detections of one frame, as a worker sends them."""
 
     detections: FrameDetections
-    """Without picture; the masks have one bit per pixel, and `keypoints` is not a function but its result."""
+    """Without picture; the masks have one bit per pixel."""
     shapes: list[tuple[int, int]]
     """Heights and widths of the masks."""
 
@@ -59,8 +59,7 @@ def detect_on_workers(
 ) -> Generator[FrameDetections | int]:
     """Return the detections of worker processes, as `jaxfit.perception.detections.detect`.
 
-    The keypoints of all instances are detected, because the tracker works in this process. Frames that no worker could
-    compute count as damaged.
+    Frames that no worker could compute count as damaged.
 
     Args:
         cluster: the workers.
@@ -135,7 +134,7 @@ def detect_range(shared: DetectionShared, frames: range) -> list[DetectedFrame |
                 raise InputError(file, "differs from the file of the command", "copy the same file to all machines")
         reader = read_frames(shared.video, frames.start, frames.stop, frames.step)
         segmenter, keypoints = _networks(shared.config, states[1:])
-        detections = detect(reader, segmenter, keypoints, Clock())
+        detections = detect(reader, segmenter, keypoints, Clock(), frames_at_once(shared.config))
         return [item if isinstance(item, int) else _packed(item) for item in detections]
     except InputError as error:
         raise InputError(f"worker on {platform.node()}: {error.source}", error.problem, error.remedy) from error
@@ -144,8 +143,6 @@ def detect_range(shared: DetectionShared, frames: range) -> list[DetectedFrame |
 @lru_cache(1)
 def _networks(config: TrackConfig, _states: tuple[tuple[int, int], ...]) -> tuple[Segmenter, KeypointDetector]:
     """Load the networks of a config, and keep them for further tasks while their files have the same states."""
-    if hasattr(os, "sched_getaffinity"):  # ONNX Runtime does not see that a worker has a share of the cores
-        config = replace(config, threads=config.threads or len(os.sched_getaffinity(0)))
     return open_segmenter(config), open_keypoint_detector(config)
 
 
@@ -179,8 +176,7 @@ def _with_absolute_paths(config: TrackConfig) -> TrackConfig:
 def _packed(detections: FrameDetections) -> DetectedFrame:
     shapes = [instance.mask.shape for instance in detections.instances]
     instances = [instance._replace(mask=np.packbits(instance.mask)) for instance in detections.instances]
-    keypoints: Any = detections.keypoints()
-    return DetectedFrame(detections._replace(instances=instances, keypoints=keypoints, picture=None), shapes)
+    return DetectedFrame(detections._replace(instances=instances, picture=None), shapes)
 
 
 def _unpacked(detected: DetectedFrame) -> FrameDetections:
@@ -188,5 +184,4 @@ def _unpacked(detected: DetectedFrame) -> FrameDetections:
         instance._replace(mask=np.unpackbits(instance.mask, count=height * width).reshape(height, width).astype(bool))
         for instance, (height, width) in zip(detected.detections.instances, detected.shapes, strict=True)
     ]
-    keypoints: Any = detected.detections.keypoints
-    return detected.detections._replace(instances=instances, keypoints=lambda: keypoints)
+    return detected.detections._replace(instances=instances)

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,6 +14,8 @@ from jaxfit.data.observations import FROM_OUTLINE
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS
 from jaxfit.perception import track
+from jaxfit.perception.detections import in_threads
+from jaxfit.perception.network import OUTPUT, ActivationMonitor, ActivationStatistics
 from jaxfit.perception.track import open_segmenter, run_tracking, track_video
 from jaxfit.video.writer import VideoWriter
 
@@ -156,7 +159,7 @@ def test_progress_reports_speed_and_birds(video):
 
 def test_durations_of_all_parts(video):
     tracking, _, _ = tracked(video)
-    assert set(tracking.seconds) == {"detect", "track", "keypoints", "record", "clean up"}
+    assert set(tracking.seconds) == {"detect", "track", "record", "clean up"}
 
 
 def test_the_segmenter_runs_a_few_frames_ahead(video):
@@ -173,6 +176,25 @@ def test_the_segmenter_runs_a_few_frames_ahead(video):
     assert max(ahead) <= 3
 
 
+def test_several_frames_at_once():
+    """Their results come in order, at most so many are computed at once, and each thread has its own distances."""
+    count, running, most, together = 3, [], [], threading.Barrier(3, timeout=60)
+    monitor = ActivationMonitor(
+        SimpleNamespace(check_outputs=lambda *_: None), ActivationStatistics(np.zeros(1), np.eye(1))
+    )
+
+    def compute(n):
+        running.append(n)
+        monitor.add({OUTPUT: np.full((1, 1), n)}, 1)
+        together.wait()  # ends only if three threads are here
+        most.append(len(running))
+        running.remove(n)
+        return n, monitor.take().tolist()
+
+    assert list(in_threads(compute, range(4 * count), count)) == [(n, [n]) for n in range(4 * count)]
+    assert max(most) == count
+
+
 def test_an_error_in_the_thread_of_the_segmenter(video):
     """The error arrives after the frames before it, and the threads end."""
 
@@ -186,7 +208,7 @@ def test_an_error_in_the_thread_of_the_segmenter(video):
     with pytest.raises(InputError, match=r"net\.onnx: cannot be run \(check the layout of its inputs\)"):
         run_tracking(video, TrackConfig(min_track_frames=2), Failing(FOOTAGE), keypoints)
     assert len(keypoints.counts) == 5
-    assert not [thread for thread in threading.enumerate() if thread.name == "ahead"]
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith(("ahead", "detect"))]
 
 
 def test_number_of_opencv_threads_is_restored(video):
