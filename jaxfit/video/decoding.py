@@ -151,18 +151,22 @@ def frame_times(path: Path, stop: int) -> Float[np.ndarray, "F"]:
     return np.array([float(stamp * time_base) for stamp in packets.stamps[:stop]], np.float64)
 
 
-def decode(path: Path, numbers: range, size_px: tuple[int, int], stopped: Callable[[], bool]) -> Iterator[Frame | int]:
+def decode(
+    path: Path, numbers: range, size_px: tuple[int, int], stopped: Callable[[], bool], part: int = 1
+) -> Iterator[Frame | int]:
     """Yield the requested frames of a video in order. For a damaged frame, yield only its number.
 
     If the container has time stamps (mp4, mkv, webm), the packets of earlier frames are counted and not decoded.
-    Decoding starts at the third last keyframe before the first requested frame. A stream with gradual refresh has no
-    true keyframes, and needs up to two of its recovery points until its pictures are complete.
+    Decoding starts at the last keyframe before the first requested frame that refreshes the decoder at once (IDR), or
+    else at the third last keyframe: a stream with gradual refresh has no true keyframes, and needs up to two of its
+    recovery points until its pictures are complete.
 
     Args:
         path: the file.
         numbers: numbers of the requested frames.
         size_px: width and height of the video as players show it.
         stopped: called between packets; True ends the decoding.
+        part: as for `read_frames`.
 
     Raises:
         InputError: the file is not a readable video, no picture of it can be decoded, or a picture has another size.
@@ -170,10 +174,14 @@ def decode(path: Path, numbers: range, size_px: tuple[int, int], stopped: Callab
     if not numbers:
         return
     with opened(path) as (container, stream):
-        stamps = _seek(path, container, stream, numbers.start)
+        stamps, turn = _seek(path, container, stream, numbers.start), None
         for number, time_s, picture in deinterlaced(path, _numbered(path, container, stream, stamps, stopped)):
+            if picture is not None and (turn is None or picture.key_frame):
+                # reading it keeps a picture in memory until a garbage collection
+                turn = display_turn(picture) or (False, False, False)
             if number in numbers:
-                yield number if picture is None else Frame(number, _pixels(path, number, picture, size_px), time_s)
+                pixels = None if picture is None else _pixels(path, number, picture, turn, size_px, part)
+                yield number if pixels is None else Frame(number, pixels, time_s)
             if number >= numbers[-1]:
                 return
 
@@ -184,29 +192,29 @@ class _Packets(NamedTuple):
     count: int
     stamps: list[int] | None
     """Time stamps in the order of presentation; None if stamps are missing or contradict each other."""
-    keys: list[int]
-    """Numbers of the keyframes."""
+    keys: list[tuple[int, bool]]
+    """Numbers of the keyframes, and whether they refresh the decoder at once."""
 
 
 def _packets(path: Path, stop: int) -> _Packets:
     """Return the frames from the first picture that can be decoded to at least frame `stop`, without decoding."""
     with opened(path) as (container, stream):
         first, has_stamps = first_picture(container, stream), _has_stamps(container, stream)
-    frames: list[tuple[int | None, bool]] = []
+    frames: list[tuple[int | None, bool, bool]] = []
     with opened(path) as (container, stream):
         try:
             for packet in filter(_is_shown, _rising(container, stream)):
                 if first is None or None in (first.pts, packet.pts) or packet.pts >= first.pts:
-                    frames.append((packet.pts, packet.is_keyframe))
+                    frames.append((packet.pts, packet.is_keyframe, packet.is_keyframe and _refreshes(packet)))
                 if len(frames) > stop + _REORDER:
                     break
         except FFmpegError:  # the file ends here
             pass
-    stamps: set[Any] = {stamp for stamp, _ in frames}
+    stamps: set[Any] = {stamp for stamp, *_ in frames}
     if not has_stamps or None in stamps or len(stamps) < len(frames):
         return _Packets(len(frames), None, [])
     frames.sort()
-    return _Packets(len(frames), sorted(stamps), [i for i, (_, is_key) in enumerate(frames) if is_key])
+    return _Packets(len(frames), sorted(stamps), [(i, whole) for i, (_, is_key, whole) in enumerate(frames) if is_key])
 
 
 def _rising(container: Any, stream: Any) -> Iterator[Any]:
@@ -233,6 +241,20 @@ def _has_stamps(container: Any, stream: Any) -> bool:
     return not (is_avi or (container.format.name in _RAW and frame_rate(stream) is None))
 
 
+def _refreshes(packet: Any) -> bool:
+    """Return whether the packet of a keyframe, as MP4 and Matroska store it, has an IDR picture of H.264 or HEVC."""
+    kinds = {"h264": (31, 0, {5}), "hevc": (126, 1, {19, 20})}
+    if packet.stream.codec_context.name not in kinds:
+        return False
+    mask, shift, wanted = kinds[packet.stream.codec_context.name]
+    content, at = memoryview(packet), 0
+    while at + 4 < len(content):  # units with their lengths before them
+        if (content[at + 4] & mask) >> shift in wanted:
+            return True
+        at += 4 + int.from_bytes(content[at : at + 4], "big")
+    return False
+
+
 def _is_shown(packet: Any) -> bool:
     """Return whether players show the picture of a packet."""
     # no content: a repeated picture in AVI, or the end of a stream. VP8 has packets that serve only as references.
@@ -241,17 +263,18 @@ def _is_shown(packet: Any) -> bool:
 
 
 def _seek(path: Path, container: Any, stream: Any, start: int) -> list[int]:
-    """Move to the third last keyframe up to frame `start`; return the time stamps of the frames up to there and beyond.
+    """Move to a keyframe before frame `start` (`decode`); return the time stamps of the frames up to there and beyond.
 
     Returns an empty list, and stays at the beginning, if the file has no time stamps to seek by.
     """
     if not start or container.format.name not in (MP4, MATROSKA):
         return []
     packets = _packets(path, start)
-    keys = packets.keys[: bisect_left(packets.keys, start + 1)][-3:]
-    if packets.stamps is None or not keys or keys[0] == 0:
+    keys = [key for key in packets.keys if key[0] <= start][-3:]
+    first = next((number for number, refreshes in reversed(keys) if refreshes), keys[0][0] if keys else 0)
+    if packets.stamps is None or first == 0:
         return []
-    container.seek(packets.stamps[keys[0]], stream=stream)
+    container.seek(packets.stamps[first], stream=stream)
     return packets.stamps
 
 
@@ -426,17 +449,23 @@ def displayed_size(picture: Any) -> tuple[int, int]:
     return (picture.height, picture.width) if is_transposed else (picture.width, picture.height)
 
 
-def _pixels(path: Path, number: int, picture: Any, size_px: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+def _pixels(
+    path: Path, number: int, picture: Any, turn: Any, size_px: tuple[int, int], part: int
+) -> UInt8[np.ndarray, "H W 3"]:
     """Return the pixels of a decoded picture, turned as players turn the picture.
 
     The conversion follows the colour matrix and the range of the picture; BT.601 without a matrix, as in FFmpeg.
     """
-    width, height = displayed_size(picture)
+    is_transposed, is_reversed_x, is_reversed_y = turn
+    width, height = (picture.height, picture.width) if is_transposed else (picture.width, picture.height)
     if (width, height) != size_px:
         problem = f"its frame {number} is {width}×{height}, but the video is {size_px[0]}×{size_px[1]}"
         raise InputError(path, problem, "convert the video to a single size")
-    picture_bgr = picture.to_ndarray(format="bgr24", interpolation=EXACT)
-    is_transposed, is_reversed_x, is_reversed_y = display_turn(picture) or (False, False, False)
+    if part == 1:
+        picture_bgr = picture.to_ndarray(format="bgr24", interpolation=EXACT)
+    else:
+        smaller = {"width": max(picture.width // part, 1), "height": max(picture.height // part, 1)}
+        picture_bgr = picture.to_ndarray(format="bgr24", interpolation=Interpolation.AREA, **smaller)
     if is_transposed:
         picture_bgr = cv2.transpose(picture_bgr)
     if is_reversed_x or is_reversed_y:

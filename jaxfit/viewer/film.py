@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
+from threading import Condition, Thread
 
 import cv2
 import numpy as np
@@ -19,6 +22,13 @@ from jaxfit.view.overlay import FOLDER_FPS
 PLAYED = (".mp4", ".m4v", ".webm", ".mov")
 """Suffixes of films that browsers may play. The page shows pictures of the frames if its browser does not."""
 JPEG_QUALITY = 85
+MAX_WIDTH = 1920
+"""Width of the pictures, pixels, at most; wider films are shown in a half, a third and so on of their size."""
+MOST_BYTES = 64_000_000
+"""Bytes of pictures in memory, at most."""
+NEAR, AHEAD, BLOCK = 8, 64, 128
+"""Frames that are decoded after a request, and steps back that count as a movement backward; frames that are expected
+in such a movement, and frames that are then decoded at once."""
 
 
 def is_played(video: Path) -> bool:
@@ -41,26 +51,111 @@ def film_times(video: Path, frames: Int[np.ndarray, "T"]) -> list[float | None]:
     return [round(time_s, 6) if np.isfinite(time_s) else None for time_s in known]
 
 
-def frame_picture(video: Path, number: int, max_width: int = 1920) -> bytes:
-    """Return one frame as JPEG.
+class Pictures:
+    """The pictures of the frames of results as JPEG. A thread decodes ahead of the requests, forward or backward.
 
     Args:
         video: a video, or a folder of images.
-        number: number of the frame.
-        max_width: greatest width in pixels.
+        frames: numbers of the frames of the results, ascending.
 
     Raises:
-        InputError: the video cannot be read, or has no such frame.
+        InputError: the video cannot be read.
     """
-    found = next(iter(read_frames(video, number, number + 1)), None)
-    if found is None:
-        raise InputError(video, f"has no frame {number}", "give the video of the result")
-    picture = found.picture
-    if picture.shape[1] > max_width:
-        height = max(1, round(picture.shape[0] * max_width / picture.shape[1]))
-        picture = cv2.resize(picture, (max_width, height), interpolation=cv2.INTER_AREA)
-    encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-    return encoded.tobytes()
+
+    def __init__(self, video: Path, frames: Int[np.ndarray, "T"]):
+        self._video, self._frames, self._step = video, set(frames.tolist()), frame_step(frames)
+        self._part = -(-probe_video(video).size_px[0] // MAX_WIDTH)
+        self._pictures: OrderedDict[int, bytes | Exception] = OrderedDict()  # those used last are last
+        self._asked: list[int] = []
+        """Numbers that requests wait for; the newest is last."""
+        self._last, self._by = int(frames[0]), self._step
+        """The number of the newest request, and the step to the next number that is expected."""
+        self._reader, self._position = iter(()), -1
+        """A reader, and the number of the frame that it reads next."""
+        self._changed, self._works = Condition(), False
+
+    def picture(self, number: int) -> bytes:
+        """Return the picture of a frame, as JPEG of at most `MAX_WIDTH` pixels width.
+
+        Raises:
+            InputError: the video cannot be read, or the frame is not one of the results or of the video.
+        """
+        if number not in self._frames:
+            raise InputError(self._video, f"has no frame {number} that is shown", "reload the page")
+        with self._changed:
+            back = 0 < self._last - number <= NEAR * self._step
+            self._last, self._by = number, -self._step if back else self._step
+            self._asked.append(number)
+            if not self._works and self._missing():
+                self._works = True
+                Thread(target=self._work, name="jaxfit pictures", daemon=True).start()
+            self._changed.wait_for(lambda: number in self._pictures)
+            self._asked.remove(number)
+            self._pictures.move_to_end(number)
+            found = self._pictures[number]
+            if isinstance(found, Exception):
+                del self._pictures[number]  # the next request tries again
+                raise found
+            return found
+
+    def _waited(self) -> int | None:
+        """Return the newest number that a request waits for."""
+        return next((number for number in reversed(self._asked) if number not in self._pictures), None)
+
+    def _missing(self) -> range:
+        """Return the numbers to decode next: what the newest request waits for, or else what is expected."""
+        waited = self._waited()
+        expected = range(self._last, self._last + (NEAR if self._by > 0 else AHEAD) * self._by, self._by)
+        expected = (number for number in expected if number in self._frames and number not in self._pictures)
+        number = next(expected, None) if waited is None else waited
+        if number is None:
+            return range(0)
+        if self._by > 0:
+            return range(number, number + NEAR * self._step, self._step)
+        # a film has to be decoded from a keyframe on, so that pictures in the background are many
+        count = BLOCK if waited is None else NEAR
+        return range(max(number + (count - 1) * self._by, min(self._frames)), number + 1, self._step)
+
+    def _work(self) -> None:
+        """Decode until nothing is missing."""
+        while True:
+            with self._changed:
+                numbers = self._missing()
+                self._works = bool(numbers)
+            if not numbers:
+                return
+            try:
+                if self._position != numbers[0]:
+                    self._reader = iter(read_frames(self._video, numbers[0], None, self._step, part=self._part))
+                    self._position = numbers[0]
+                self._read(numbers)
+            except Exception as error:  # every request has to end
+                self._position = -1
+                self._keep({number: error for number in numbers})
+
+    def _read(self, numbers: range) -> None:
+        """Keep the pictures of frames, until a request waits for another frame."""
+        while self._position in numbers and self._waited() in (None, *numbers):
+            frame = next(self._reader, None)
+            number = numbers[-1] + self._step if frame is None else frame.index
+            lost = InputError(self._video, f"has no frame {self._position}", "give the video of the result")
+            self._keep({each: lost for each in range(self._position, number, self._step)})
+            if frame is None:
+                self._position = -1
+            else:
+                if number in self._frames:
+                    _, jpeg = cv2.imencode(".jpg", frame.picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+                    self._keep({number: jpeg.tobytes()})
+                self._position = number + self._step
+
+    def _keep(self, pictures: Mapping[int, bytes | Exception]) -> None:
+        with self._changed:
+            self._pictures |= {number: picture for number, picture in pictures.items() if number in self._frames}
+            sizes = [len(each) if isinstance(each, bytes) else 0 for each in self._pictures.values()]
+            while sum(sizes) > MOST_BYTES and len(sizes) > 1:
+                self._pictures.popitem(last=False)
+                del sizes[0]
+            self._changed.notify_all()
 
 
 def write_copy(

@@ -25,7 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import parse_json
 from jaxfit.viewer.blank import Blank
-from jaxfit.viewer.film import film_times, frame_picture, is_played
+from jaxfit.viewer.film import Pictures, film_times, is_played
 from jaxfit.viewer.page import FILES, index, policy
 from jaxfit.viewer.session import EditsChangedError, Session
 from jaxfit.viewer.shown import Shown, frames_of
@@ -80,6 +80,12 @@ class Viewer:
         source = "film" if is_played(self.video) else None
         times_s = film_times(self.video, frames_of(self.results)) if source else None
         return {"source": source, "times_s": times_s, "pictures": True}
+
+    @cached_property
+    def pictures(self) -> Pictures:
+        """The pictures of the film, which exists."""
+        assert self.video is not None
+        return Pictures(self.video, frames_of(self.results))
 
     def show_refit(self, folder: Path) -> None:
         """Show the result of a refit, in place of an earlier one, beside the result."""
@@ -137,8 +143,9 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         return FileResponse(viewer.existing_film())  # answers byte ranges
 
     async def picture(request: Request) -> Response:
-        film, number = viewer.existing_film(), _number(request.path_params["number"])
-        return Response(await run_in_threadpool(frame_picture, film, number), media_type="image/jpeg")
+        number = _number(request.path_params["number"])
+        viewer.existing_film()
+        return Response(await run_in_threadpool(viewer.pictures.picture, number), media_type="image/jpeg")
 
     async def change(request: Request) -> Response:
         session = viewer.session

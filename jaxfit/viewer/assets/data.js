@@ -64,7 +64,7 @@ async function savedText(path) {
 }
 
 /** @param {string} path @returns {Promise<ArrayBuffer>} */
-async function content(path) {
+export async function content(path) {
   if (isSaved) {
     const stream = new Blob([decoded(await savedText(path))]).stream();
     return new Response(stream.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
@@ -82,12 +82,6 @@ async function problem(answer) {
   } catch {
     return text || `the server answered ${answer.status}`;
   }
-}
-
-/** Why the server does not send a picture. @param {string} path */
-export async function problemOf(path) {
-  const answer = await fetch(path);
-  return answer.ok ? "The browser cannot show the picture." : problem(answer);
 }
 
 /** @param {ArrayBuffer} buffer @returns {Packed} */

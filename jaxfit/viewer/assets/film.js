@@ -1,12 +1,14 @@
 // The film with outlines, keypoints and error ellipses of all birds.
 // @ts-check
-import { filmAddress, problemOf } from "viewer/data";
+import { content, filmAddress } from "viewer/data";
 
 /** @typedef {import("viewer/data").Packed} Packed */
 /** @typedef {import("viewer/data").ResultFacts} ResultFacts */
 
 const MISSING = -32768;
-const CACHE_BYTES = 250e6;
+const CACHE_BYTES = 100e6;
+/** How long a frame is shown before its picture gets all pixels of a wide film, milliseconds. */
+const REST_MS = 150;
 /** Largest distance from the beginning of a frame at which the film is stopped to show the frame, seconds. */
 const MARGIN_S = 1e-3;
 /** Longest wait for the picture of a film at rest, milliseconds. */
@@ -62,7 +64,6 @@ export class Film {
       video.onerror = () => done(false);
     });
     if (opened) this.video = video;
-    else if (!this.pictures) this.problem = "The browser cannot play the film.";
   }
 
   /** Position of the frame that a playing film shows, −1 for a frame between those of the results. @param {number} time */
@@ -81,7 +82,10 @@ export class Film {
       video.onerror = done;
       video.currentTime = time;
     });
-    if (video.error) return false; // the film was removed or replaced
+    if (video.error) {
+      this.video = null; // the film was removed or replaced
+      return false;
+    }
     // the picture may come after the event; at a variable rate, browsers may stop at a neighbour of the frame
     const mediaTime = await Promise.race([shown, new Promise((done) => setTimeout(done, SHOWN_MS, null))]);
     const exact = mediaTime === null ? null : Math.abs(mediaTime - time) <= 2 * this.margin;
@@ -91,37 +95,43 @@ export class Film {
 
   /** Shows a frame; resolves when its picture is there. @param {number} i position of the frame */
   async seek(i) {
-    const known = this.shown.get(i);
-    if (known) {
-      this.shown.delete(i); // the newest is last
-      this.shown.set(i, known);
-      this.picture = known;
-      return;
-    }
-    const video = this.video, exact = video && (await this.move(video, i));
-    if (video?.error) this.video = null;
-    if (video && (exact || !this.pictures) && !video.error) {
-      this.picture = await createImageBitmap(video);
-      this.problem = exact !== false ? "" : "The browser shows a frame of the film beside this one.";
-      this.shown.set(i, this.picture);
-      const most = Math.max(CACHE_BYTES / (4 * video.videoWidth * video.videoHeight), 2);
-      for (const [old, picture] of this.shown) {
-        if (this.shown.size <= most) break;
-        this.shown.delete(old);
-        picture.close();
-      }
-      return;
-    }
-    if (!this.pictures) return;
-    const image = new Image();
-    image.src = `frames/${this.frames[i]}`;
     try {
-      await image.decode();
-      this.picture = image;
+      const picture = this.shown.get(i) ?? (this.pictures ? await createImageBitmap(new Blob([await content(`frames/${this.frames[i]}`)])) : await this.stopped(i));
       this.problem = "";
-    } catch {
+      this.keep(i, picture);
+    } catch (error) {
       this.picture = null;
-      this.problem = await problemOf(image.src);
+      this.problem = String(/** @type {Error} */ (error).message);
+    }
+  }
+
+  /** The picture of the video at a frame. @param {number} i position of the frame */
+  async stopped(i) {
+    const { video } = this, exact = video && (await this.move(video, i));
+    if (!video) throw new Error("The browser cannot play the film.");
+    if (exact === false) throw new Error("The browser shows no picture of this frame of the film.");
+    return createImageBitmap(video);
+  }
+
+  /** Replaces the picture of a wide film, which the server makes smaller, when the reader rests; whether it did so. @param {number} i position of the frame */
+  async sharpen(i) {
+    const { picture, video } = this;
+    if (!this.pictures || !video || !(picture instanceof ImageBitmap) || picture.width >= video.videoWidth) return false;
+    await new Promise((done) => setTimeout(done, REST_MS));
+    if (this.picture !== picture || !(await this.move(video, i)) || this.picture !== picture) return false;
+    this.keep(i, await createImageBitmap(video));
+    return true;
+  }
+
+  /** @param {number} i position of the frame @param {ImageBitmap} picture */
+  keep(i, picture) {
+    this.picture = picture;
+    this.shown.delete(i); // the newest is last
+    this.shown.set(i, picture);
+    for (const [old, { width, height }] of this.shown) {
+      if (4 * width * height * this.shown.size <= CACHE_BYTES || old === i) break;
+      this.shown.get(old)?.close();
+      this.shown.delete(old);
     }
   }
 }
@@ -277,7 +287,7 @@ export class FilmView {
       this.canvas.width = width;
       this.canvas.height = height;
     }
-    const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d"));
+    const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d", { willReadFrequently: true }));
     if (this.follows && poses && t >= 0) this.follow(poses, t, selected);
     const { scale, x, y } = this.placement(), [w, h] = this.facts.size_px;
     context.setTransform(1, 0, 0, 1, 0, 0);
@@ -381,7 +391,7 @@ export class FilmView {
   /** Position of the track under the pointer, −1 for none. @param {MouseEvent} event */
   birdAt(event) {
     const [px, py] = this.inFilm(event);
-    const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d"));
+    const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d", { willReadFrequently: true }));
     context.setTransform(1, 0, 0, 1, 0, 0);
     let found = -1;
     if (this.outlines) {

@@ -161,6 +161,7 @@ async function draw(seek) {
   } catch (error) {
     find("notes").textContent = String(/** @type {Error} */ (error).message);
   }
+  if (toFrame) state.film?.sharpen(i).then((sharper) => { if (sharper) refresh(); });
   showNumbers();
   if (state.columns[0].facts.labelling) showKeypoints();
   else showWhy();
@@ -310,8 +311,8 @@ async function play() {
   state.playing = true;
   if (state.i >= state.frames.length - 1) state.i = 0;
   const speed = Number(find("speed").value), video = state.film?.video;
-  if (video && state.film) {
-    await state.film.move(video, state.i);
+  if (video) await state.film?.move(video, state.i);
+  if (video && state.film?.video) {
     state.film.picture = video;
     video.playbackRate = speed;
     await video.play();

@@ -76,7 +76,7 @@ export class Timeline {
     canvas.height = Math.round(this.height * ratio);
     canvas.style.width = `${width}px`;
     canvas.style.height = `${this.height}px`;
-    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+    const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", { willReadFrequently: true }));
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, this.height);
     return { context, width };
