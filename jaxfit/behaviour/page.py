@@ -119,12 +119,6 @@ class BehaviourPage:
         """Positions of the kinds that occur."""
         return [kind for kind in range(len(self.kinds)) if (self.ethogram.state == kind).any()]
 
-    @property
-    def meanings(self) -> list[tuple[str, str]]:
-        """Words of the section and their definitions."""
-        kinds = [(kind.name[:1].upper() + kind.name[1:], kind.definition) for kind in self.kinds]
-        return [*MEANINGS.items(), *kinds, *((curve.title, curve.definition) for curve in self.curves)]
-
     def section(self, order: Sequence[int], film: str | None) -> str:
         """Return the section of the report, HTML.
 
@@ -148,6 +142,7 @@ class BehaviourPage:
             budget=of_all,
             absent=[self.kinds[kind].name for kind, row in of_all if not row.share > 0],
             shares=shares,
+            titles=MEANINGS,
         )
 
     def marks(self, bird: int, film: str | None) -> list[Mark]:
@@ -190,7 +185,7 @@ class BehaviourPage:
                 f"One column shows {self.axis.per_column} frames. A column with several behaviours shows the behaviour "
                 "that stands first in the legend, so short bouts look longer than they are."
             )
-        return [*notes, "White: no pose."]
+        return [*notes, "Empty: no pose."]
 
     def svg(self, title: str = "Ethogram", film: str | None = None) -> str:
         """Return the ethogram as a file of its own: title, legend, axis, one row for each bird, and notes.

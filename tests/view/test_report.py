@@ -47,7 +47,13 @@ def parsed(text):
 
 
 def section(root, title):
-    return next((each for each in root.iter("section") if each.findtext("h2") == title), None)
+    titled = ((each, each.find("h2"), each.find("details/summary/h2")) for each in root.iter("section"))
+    return next((each for each, *heads in titled if title in [head.text for head in heads if head is not None]), None)
+
+
+def titles(element):
+    """Return the explained words and their meanings."""
+    return {text_of(each): each.get("title") for each in element.iter("abbr")}
 
 
 def text_of(element):
@@ -128,7 +134,9 @@ def test_the_table_holds_the_numbers_of_the_result(root, made):
     assert rows["8"][-2] == "–"
     assert "8 poses53.3 % of the detections" in text_of(with_class(root, "cards")[0])
     assert "Tracks 7, 8: some or all frames have no pose" in text_of(section(root, "Warnings"))
-    assert "With detections of networks, error bars are too narrow" in text_of(section(root, "What the words mean"))
+    words = titles(root)
+    assert "With detections of networks, error bars are too narrow" in words["Error bars"]
+    assert all(words[word] for word in ("tracks", "poses", "trust", "Status", "Confidence", "Objective"))
 
 
 def test_the_curve_of_error_bars_has_marks_at_flagged_frames(root):
@@ -264,7 +272,7 @@ def test_metrics_against_a_known_truth_are_tables(report):
     table = Measured(["track", "IoU <"], [("3", "0.9"), ("7", "0.8")], "IoU: overlap")
     shown = section(parsed(page(report, [], [table])), "Comparison with the truth")
     assert rows_of(shown) == {"track": ["IoU <"], "3": ["0.9"], "7": ["0.8"]}
-    assert shown.findtext("p") == "IoU: overlap"
+    assert shown.findtext("details/p") == "IoU: overlap"
     assert section(parsed(page(report, [])), "Comparison with the truth") is None
 
 
@@ -370,9 +378,10 @@ def test_bouts_have_tooltips_and_lead_to_the_film(behaving):
 
 def test_words_of_the_behaviour_are_text(behaving):
     assert with_class(behaving, "notes")[0].findall("li")[1].text == "The vertical is <estimated>."
-    words = text_of(section(behaving, "What the words mean"))
-    for word in ("Ethogram", "Bout", "Time budget", f"{BOW}It <i>bows</i>.", "Pitch <of> the body."):
-        assert word in words
+    words = titles(section(behaving, "Behaviour"))
+    assert words[BOW] == "It <i>bows</i>."
+    assert "Pitch <of> the body." in words.values()
+    assert all(words[word] for word in ("Ethogram", "Bouts", "Time budget"))
 
 
 def test_pages_without_behaviour_have_no_section(report, behaviour, folder, made):

@@ -158,13 +158,6 @@ def page(
     Raises:
         ValueError: `behaviour` has other birds or frames.
     """
-    meanings = list(_MEANINGS.items())
-    if not report.over_time:
-        meanings = [pair for pair in meanings if pair[0] != "Size in the image"]
-    if not report.has_error_bars:
-        meanings = [pair for pair in meanings if pair[0] != "Error bars"]
-    if not report.body_lengths:
-        meanings = [pair for pair in meanings if pair[0] != "Body"]
     section = None
     if behaviour is not None and report.over_time and report.poses:
         if len(behaviour.track_id) != len(report.tracks) or not np.array_equal(behaviour.frames, report.frames):
@@ -172,8 +165,7 @@ def page(
             came = f"{len(behaviour.track_id)} birds and {len(behaviour.frames)} frames"
             raise ValueError(f"behaviour: expected {expected}, got {came}")
         section = behaviour.section([track.position for track in report.tracks], film)
-        meanings += behaviour.meanings
-    headings, rows = _table(report)
+    headings, rows = _table(report, bool(report.body_lengths) and not pictures)  # pictures have them beside the birds
     length = counted(report.photographs, "photograph") if report.photographs else counted(len(report.frames), "frame")
     if not report.photographs and report.duration_s is not None:
         length += f", {duration(report.duration_s)}"
@@ -191,8 +183,7 @@ def page(
         marks=_MARKS,
         table_headings=headings,
         table_rows=rows,
-        meanings=meanings,
-        titles=dict(meanings),
+        titles=_MEANINGS,
         tracks={track.track_id: track for track in report.tracks},
         facts=[*footage, ("result", report.folder), *report.facts.items()],
         behaviour=behaviour,
@@ -214,7 +205,7 @@ def _footage(report: Report) -> str:
     return " · ".join(parts)
 
 
-def _table(report: Report) -> tuple[list[tuple[str, str]], list[tuple[Track, list[Cell]]]]:
+def _table(report: Report, bodies: bool) -> tuple[list[tuple[str, str]], list[tuple[Track, list[Cell]]]]:
     """Return the names and units of the columns of the table of tracks, and the cells after the status."""
     names, over_time = [("Track", ""), ("Status", "")], report.over_time
     names += [("Frames", "first to last")] if over_time else []
@@ -226,7 +217,7 @@ def _table(report: Report) -> tuple[list[tuple[str, str]], list[tuple[Track, lis
     names.append(("Objective", "per pose"))
     names += [("Error bars", "% of length, 0 to 10 %" if over_time else "% of length")] if report.has_error_bars else []
     names += [("Size in the image", "±30 %")] if over_time else []
-    if report.body_lengths:
+    if bodies:
         names.append(("Body", f"{' / '.join(report.body_lengths)}, % of the model"))
     rows = []
     for track in report.tracks:
@@ -250,7 +241,7 @@ def _table(report: Report) -> tuple[list[tuple[str, str]], list[tuple[Track, lis
         if over_time:
             curve = size_curve(track)
             cells.append(Cell("–" if curve is None else "", curve))
-        if report.body_lengths:
+        if bodies:
             cells.append(Cell(track.body))
         rows.append((track, cells))
     return names, rows
