@@ -23,8 +23,6 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import check_readable, read_text
 
 _TAG = "tag:yaml.org,2002:"
-_MAX_VALUES = 100_000
-"""Most values of a text; an alias counts with all values of its anchor, so that a short text cannot fill the memory."""
 
 
 class YamlMapping(NamedTuple):
@@ -44,8 +42,8 @@ def read_yaml(text: str, source: object) -> YamlMapping:
         source: the file, for messages.
 
     Raises:
-        InputError: the text is not valid YAML or not a mapping, holds a tag, a key that is not text, a key twice, or
-            more values than a config can need; the message names the line.
+        InputError: the text is not valid YAML or not a mapping, holds a tag, a key that is not text, or a key twice.
+            The message names the line.
     """
     loader = YAML(typ="safe", pure=True)
     try:
@@ -77,7 +75,6 @@ class _Reader:
 
     def __init__(self, source: object, constructor: Any):
         self._source, self._constructor = source, constructor
-        self._values = 0
         self.lines: dict[str, int] = {}
 
     def mapping(self, node: MappingNode, path: str) -> dict[str, Any]:
@@ -105,9 +102,6 @@ class _Reader:
 
     def _value(self, node: Any, path: str) -> Any:
         line = node.start_mark.line + 1
-        self._values += 1
-        if self._values > _MAX_VALUES:
-            self._fail(line, f"is value number {_MAX_VALUES + 1:,}, values of aliases included", "write fewer values")
         kind = node.tag.removeprefix(_TAG)
         if kind not in ("map", "seq", "str", "null", "bool", "int", "float", "timestamp", "value"):
             self._fail(line, f"holds the tag `{node.tag}`", "remove the tag; quotes make a value text")

@@ -21,7 +21,7 @@ the errors would then lower the weight again.
 
 Offsets of the keypoints (`fitting/keypoint_offsets.py`) are learnt in the same rounds, before the scales.
 
-Not learnt, with reasons in docs/results/settings.md: the weight of `pose_prior` and the scales of the motion terms.
+Not learnt: the weight of `pose_prior` and the scales of the motion terms.
 
 Source: MacKay 1992, *Bayesian interpolation* (γ and the fixed point); Lange, Little and Taylor 1989, *Robust
 statistical modeling using the t distribution* (w); Tipping 2001, *Sparse Bayesian learning and the relevance vector

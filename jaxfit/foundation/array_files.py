@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,6 @@ import numpy as np
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import reading
 
-MAX_ARRAY_BYTES = 2**30
-"""Largest memory of the arrays that are read from one file: a result of about 1,000,000 birds × frames."""
 MAX_TABLE_GB = 2.0
 """Largest memory of the tables of a file, by estimate: tables have a cell for every track in every frame."""
 AGAIN = "write the file again"
@@ -107,17 +105,16 @@ def load_npy(path: str | Path, shape: str | None = None, mapped: bool = False) -
     Args:
         path: the file.
         shape: text of sizes, as in `load_npz`; None allows any shape.
-        mapped: return a read-only memory map, which may be larger than `MAX_ARRAY_BYTES`.
+        mapped: return a read-only memory map.
 
     Raises:
-        InputError: the file cannot be read, is not an ``.npy``, is truncated or too large; or the array holds values
-            other than real numbers, booleans and text, or has another shape.
+        InputError: the file cannot be read, is not an ``.npy`` or is truncated; or the array holds values other than
+            real numbers, booleans and text, or has another shape.
     """
     with reading(path, "an .npy file of plain arrays", _COPY) as path:
         if mapped:
             array: np.ndarray = np.lib.format.open_memmap(path, mode="r")
         else:
-            _check_size(path, path.stat().st_size)
             with path.open("rb") as file:
                 array = np.lib.format.read_array(file, allow_pickle=False)
         return _plain_arrays(path, {"the array": array}, {} if shape is None else {"the array": shape})["the array"]
@@ -132,8 +129,6 @@ def load_npz(
 ) -> dict[str, np.ndarray]:
     """Read the named arrays of an ``.npz`` without running pickled code; other arrays are not read.
 
-    The sizes that the file declares are checked before numbers are read.
-
     Args:
         path: the file.
         required: name → shape of each required array, as a text of sizes such as ``"N T 3"``
@@ -147,8 +142,8 @@ def load_npz(
         Name → array of real numbers, booleans or text.
 
     Raises:
-        InputError: the file cannot be read, is not an ``.npz``, is damaged, is too large or has an unsupported version;
-            or a required array is missing; or an array holds other values, or has another shape.
+        InputError: the file cannot be read, is not an ``.npz``, is damaged or has an unsupported version; or a required
+            array is missing; or an array holds other values, or has another shape.
     """
     with _archive(path) as archive:
         path = Path(path)
@@ -158,7 +153,6 @@ def load_npz(
             if name not in archive.files:
                 raise InputError(path, f"lacks the array {name}", "write the file again with this version")
         layout = dict(required) | {name: shape for name, shape in (optional or {}).items() if name in archive.files}
-        _check_declared_size(path, archive, layout)
         return _plain_arrays(path, {name: archive[name] for name in layout}, layout)
 
 
@@ -184,18 +178,6 @@ def _archive(path: str | Path) -> Iterator[np.lib.npyio.NpzFile]:
             yield archive
 
 
-def _check_declared_size(path: Path, archive: np.lib.npyio.NpzFile, names: Collection[str]) -> None:
-    """Check the size of arrays by the table of contents; zipfile reads no more than the size that stands there."""
-    members = archive.zip.infolist() if archive.zip else []
-    _check_size(path, sum(member.file_size for member in members if member.filename.removesuffix(".npy") in names))
-
-
-def _check_size(path: Path, size: int) -> None:
-    if size > MAX_ARRAY_BYTES:
-        problem = f"its arrays take {size / 1e6:,.0f} MB in memory; the limit is {MAX_ARRAY_BYTES / 1e6:,.0f} MB"
-        raise InputError(path, problem, "check the path")
-
-
 def _plain_arrays(path: Path, arrays: Mapping[str, np.ndarray], layout: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Return arrays in the byte order of this machine, after a check of their types and shapes."""
     for name, array in arrays.items():
@@ -214,7 +196,6 @@ def _plain_arrays(path: Path, arrays: Mapping[str, np.ndarray], layout: Mapping[
 def _check_version(path: Path, archive: np.lib.npyio.NpzFile, newest: int, oldest: int) -> None:
     if "format_version" not in archive.files:
         raise InputError(path, "lacks the array format_version", "write the file again with this version")
-    _check_declared_size(path, archive, {"format_version"})
     version = archive["format_version"]
     if version.shape != () or version.dtype.kind not in "iu" or version < 1:
         shown = f"of shape {version.shape}" if version.shape else version

@@ -6,14 +6,6 @@ import pytest
 
 from jaxfit.config.yaml_file import read_yaml, rounded
 
-NINE = ", ".join(f"k{i}: 1" for i in range(9))
-ANCHORS = f"a0: &a0 {{{NINE}}}\n" + "".join(
-    f"a{j}: &a{j} {{{', '.join(f'k{i}: *a{j - 1}' for i in range(9))}}}\n" for j in range(1, 10)
-)
-MERGES = f"a0: &a0 {{{NINE}}}\n" + "".join(
-    f"a{j}: &a{j} {{<<: [{', '.join([f'*a{j - 1}'] * 9)}]}}\n" for j in range(1, 10)
-)
-
 
 @pytest.mark.parametrize(
     ("text", "value"),
@@ -68,13 +60,11 @@ def test_lines():
         ("x: 1\n? [a]\n: 1", "line 2 holds the key .*, which is not text"),
         ("a: 1\nb: 2\na: 3", "line 3 holds the key `a`, which line 1 holds too"),
         ("a: 3\nb: 'x\x00'", "line 2 is not valid YAML: unacceptable character #x0000: [a-z ]*$"),
-        ("a: &a [*a]", "is nested too deeply|values of aliases"),
+        ("a: &a [*a]", "is nested too deeply"),
         ("a: *b", "line 1 is not valid YAML: found undefined alias"),
         ("a: {<<: 3}", "`<<` a value that is not a mapping"),
         ("a: 1\n---\nb: 2", "line 2 is not valid YAML: but found another document"),
         ("a: [1,\n", "is not valid YAML"),
-        (ANCHORS, "line 1 is value number 100,001"),
-        (MERGES, "line 1 is value number 100,001"),
         ("- a", "no mapping"),
         ("", "no mapping"),
         ("3", "no mapping"),
