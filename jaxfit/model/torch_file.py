@@ -37,6 +37,7 @@ STORAGE_DTYPES = {
 }
 LEGACY_MAGIC, LEGACY_PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
 _MAX_MEMO = 1_000_000
+"""Largest number of a part. The memory is for all smaller numbers: gigabytes in a damaged file."""
 
 
 class _StorageType(NamedTuple):
@@ -68,9 +69,7 @@ class _Unpickler(pickle.Unpickler):
         self.storages: dict[str, _Storage] = {}
         start = file.tell()
         for opcode, argument, _ in pickletools.genops(file):  # also checks the lengths of texts
-            if (
-                opcode.name in ("PUT", "LONG_BINPUT") and int(argument or 0) > _MAX_MEMO
-            ):  # memory for all smaller numbers
+            if opcode.name in ("PUT", "LONG_BINPUT") and int(argument or 0) > _MAX_MEMO:
                 raise pickle.UnpicklingError("it numbers its parts beyond any checkpoint")
         file.seek(start)
 
