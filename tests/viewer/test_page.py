@@ -1,7 +1,9 @@
 """The page in Chromium: film, birds in 3D and timeline show one moment; clicks, keys, corrections, saved pages."""
 
+import base64
 import dataclasses
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -28,6 +30,7 @@ from jaxfit.review.edits import read_edits
 from jaxfit.review.suggest import varied_frames
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.video.reader import read_frames
+from jaxfit.video.writer import VideoWriter
 from jaxfit.viewer import session
 from jaxfit.viewer.blank import Blank, LabelSession
 from jaxfit.viewer.page import ASSETS
@@ -91,6 +94,29 @@ class Opened:
             )
         self.page.goto(address + fragment)
         self.until("document.body.dataset.ready === 'yes'")
+
+    def film(self, path):
+        """Write what the window shows from now on as a film; returns a function that ends the film."""
+        session, pictures = self.page.context.new_cdp_session(self.page), []
+
+        def keep(event):
+            pictures.append((event["metadata"]["timestamp"], base64.b64decode(event["data"])))
+            session.send("Page.screencastFrameAck", {"sessionId": event["sessionId"]})
+
+        def end():
+            self.page.wait_for_timeout(1000)
+            session.send("Page.stopScreencast")
+            with VideoWriter(path, (self.page.viewport_size["width"], self.page.viewport_size["height"]), 10) as film:
+                for (time_s, jpeg), (next_s, _) in zip(
+                    pictures, [*pictures[1:], (pictures[-1][0] + 1, b"")], strict=True
+                ):
+                    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+                    for _ in range(min(round(10 * (next_s - time_s)), 20)):  # nobody watches a fit for long
+                        film.write(picture)
+
+        session.on("Page.screencastFrame", keep)
+        session.send("Page.startScreencast", {"format": "jpeg"})
+        return end
 
     def until(self, condition):
         """Wait until a condition holds; the policy of the page forbids `wait_for_function`."""
@@ -444,6 +470,7 @@ def wrong(tmp_path_factory):
 
 
 def test_a_dragged_keypoint_is_a_label_and_the_refit_is_better(browser, wrong, tmp_path):
+    """The variable CORRECTION_FILM names a film of the whole correction to write, `.webm` or `.mp4`."""
     folder, video, truth = wrong
     edits = tmp_path / "result.edits"
     bill = truth.keypoints_px[1, 4, 0]
@@ -454,6 +481,7 @@ def test_a_dragged_keypoint_is_a_label_and_the_refit_is_better(browser, wrong, t
     with served(folder, video, edits) as (client, viewer):
         opened = Opened(browser, client.address, "#frame=104&birds=4")
         opened.until("jaxfit.state.columns[0].films[0].points.length === 12 && !jaxfit.state.busy")
+        end = opened.film(os.environ["CORRECTION_FILM"]) if "CORRECTION_FILM" in os.environ else lambda: None
         opened.page.mouse.move(*opened.page.evaluate(IN_CLOSE, [float(bill[0] + 12), float(bill[1])]))
         opened.until("jaxfit.state.columns[0].films[0].hovered === 0")
         drag(opened, bill + np.array([12, 0]), bill)
@@ -480,6 +508,7 @@ def test_a_dragged_keypoint_is_a_label_and_the_refit_is_better(browser, wrong, t
             found = flags(np.asarray(solution.flags.doubts))[solution.valid]
             assert {row[0]: int(row[column]) for row in counts[1:]} == {flag: (found == flag).sum() for flag in FLAGS}
         assert opened.page.evaluate("jaxfit.state.timeline.after.flags.length") == 3 * 17
+        end()
         refit = viewer.results[1].folder
         opened.page.keyboard.press("Control+z")
         opened.until("jaxfit.state.columns.length === 1 && jaxfit.state.timeline.after === null")

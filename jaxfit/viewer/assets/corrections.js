@@ -49,9 +49,8 @@ export class Corrections {
     }
     if (kind === "join" || kind === "delete") return `${kind} ${selected.join(",")}`;
     if (kind === "cut") return `cut ${selected[0]}@${frame}`;
-    const known = range[0] !== null && range[1] !== null;
-    if (kind === "exclude" && !known) throw new Error("Choose a range: press [ at its first and ] at its last frame.");
-    return `${kind} ${selected.join(",")}@${known ? `${range[0]}:${Number(range[1]) + 1}` : frame}`;
+    if (range[0] !== null && range[1] !== null) return `${kind} ${selected.join(",")}@${range[0]}:${range[1] + 1}`;
+    return `${kind} ${selected.join(",")}@${frame}${kind === "exclude" ? `:${frame + 1}` : ""}`;
   }
 
   /** @param {string} kind */
@@ -174,6 +173,7 @@ export class Corrections {
     find("chosen").textContent = selected.length ? `Chosen: ${selected.join(", ")}` : "Click a bird; shift adds a second.";
     find("range").textContent = range[0] !== null || range[1] !== null
       ? `Range: frames ${range[0] ?? "…"} to ${range[1] ?? "…"}` : "Range: press [ and ], escape removes it.";
+    /** @type {HTMLButtonElement} */ (find("refit")).disabled = !this.edits.length;
     find("marked").textContent = this.marks.length ? `Frames ${this.marks.join(", ")}` : "None is marked.";
     find("edits").replaceChildren(...this.edits.map((edit) => {
       const item = document.createElement("li"), [, track, frame] = /(\d+)[^@]*@(\d+)/.exec(edit) ?? [];

@@ -150,7 +150,7 @@ export class FilmView {
     this.message.className = "message";
     parent.append(this.canvas, this.message);
     /** @type {Packed | null} */
-    this.outlines = null;
+    this.outlines = this.poses = null;
     this.redraw = () => {};
     this.t = -1;
     /** The keypoint of the chosen bird that is drawn in red. @type {{k: number, text: string} | null} */
@@ -295,6 +295,7 @@ export class FilmView {
     if (picture) context.drawImage(picture, x, y, w * scale, h * scale);
     context.setTransform(scale, 0, 0, scale, x, y);
     this.outlines = t < 0 ? null : outlines;
+    this.poses = poses;
     this.t = t;
     this.points = [];
     if (t < 0) return;
@@ -397,7 +398,14 @@ export class FilmView {
     if (this.outlines) {
       for (const [n, path] of this.paths(this.outlines, this.t)) if (context.isPointInPath(path, px, py)) found = n;
     }
-    return found;
+    if (found >= 0) return found;
+    // before its outline is there, and on its number, a bird is its box
+    const { poses, t } = this, { scale, ratio } = this.placement();
+    return this.facts.tracks.findIndex((_, n) => {
+      if (!poses || t < 0 || !poses.arrays.valid[n * poses.shapes.valid[1] + t]) return false;
+      const box = boxOf(poses, n, t), top = box.y - box.height / 2 - (18 * ratio) / scale;
+      return Math.abs(px - box.x) <= box.width / 2 && py >= top && py <= box.y + box.height / 2;
+    });
   }
 }
 

@@ -383,6 +383,7 @@ async function showRefit() {
     find("changes").append(table(["poses", "before", "refit"], column.facts.flags.map((flag, i) => [flag, `${before[i + 1]}`, `${after[i + 1]}`])));
   }
   explained = "";
+  for (const { films: [close] } of state.columns) if (close) close.followed = -1; // all get one zoom
   await showValue();
   refresh();
 }
@@ -448,7 +449,7 @@ const CORRECTING = [
   [["c"], "Cut the chosen bird at this frame", () => state.corrections?.add("cut")],
   [["j"], "Join two chosen birds", () => state.corrections?.add("join")],
   [["Delete"], "Delete the chosen birds", () => state.corrections?.add("delete")],
-  [["e"], "Exclude the chosen bird in the range", () => state.corrections?.add("exclude")],
+  [["e"], "Exclude the chosen bird in the range, or in this frame", () => state.corrections?.add("exclude")],
   [["h"], "Hide the keypoint under the pointer, or show it where it is fitted", () => hideOrShow()],
   [["x"], "Exchange left and right of the chosen bird in this frame", () => state.corrections?.all("mirror")],
   [["a"], "Accept all keypoints of the chosen bird in this frame as labels", () => state.corrections?.all("accept")],
@@ -624,6 +625,7 @@ async function open() {
   }
   readAddress();
   if (!location.hash.includes("birds=")) state.selected = new Set([first.tracks[0].id]);
+  state.corrections?.show();
   watchControls(facts.corrections !== null);
   await state.film?.open();
   state.timeline.drawStill(state.selected);
