@@ -84,7 +84,8 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
     simulation = Simulation(folder, scenes, options.varied, options.wings)
     losses = train_network(options.network, options.out, simulation, schedule, options.seed, terminal, options.base)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
-    show(f"{options.network} trained in {(time.perf_counter() - start) / 60:.0f} min, loss {loss} → {options.out}")
+    minutes = (time.perf_counter() - start) / 60
+    show(f"{options.network} trained in {minutes:.0f} min, loss {loss} → {options.out}; in 8 bits *_8bit.onnx")
 
 
 def _train_outline(options: argparse.Namespace) -> None:

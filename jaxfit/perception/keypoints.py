@@ -209,7 +209,9 @@ def _first_given(*values: int | None) -> int:
     return next(value for value in values if value is not None)
 
 
-BUILTIN_PATH, OUTLINE_PATH = (Path(__file__).parent / "networks" / name for name in ("keypoints.onnx", "outline.onnx"))
+BUILTIN_PATH, OUTLINE_PATH = (
+    Path(__file__).parent / "networks" / name for name in ("keypoints_8bit.onnx", "outline.onnx")
+)
 _PATHS = {BUILTIN: BUILTIN_PATH, OUTLINE: OUTLINE_PATH}
 NAME_SETS = {"murre": MURRE_KEYPOINTS, "aves": AVES_KEYPOINTS, "avian-mesh": AVIAN_MESH_KEYPOINTS}
 

@@ -235,8 +235,8 @@ def _nearest_peaks(
     return nearest, np.sqrt(best)
 
 
-BUILTIN = Path(__file__).parent / "networks" / "segmenter.onnx"
-"""The built-in segmenter."""
+BUILTIN = Path(__file__).parent / "networks" / "segmenter_8bit.onnx"
+"""The built-in segmenter; `segmenter.onnx` has its weights in floats, for further training."""
 
 
 _NETWORKS = {"bottom_up": BottomUp, "rf_detr": RfDetrSeg, "mask_rcnn": MaskRcnn, "yolo": YoloSeg}

@@ -19,7 +19,7 @@ FILES = BUILTIN, BUILTIN_PATH
 
 
 def test_files_are_small_and_state_their_training_data():
-    assert sum(file.stat().st_size for file in FILES) <= 12e6
+    assert sum(file.stat().st_size for file in FILES) <= 6e6
     for file in FILES:
         assert "no real footage" in OnnxModel(file).metadata["trained_on"]
     assert load_keypoint_detector().keypoint_names == MURRE_KEYPOINTS

@@ -38,7 +38,7 @@ from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.segmenter import segmenter_network
 from jaxfit.learning.priors import oas_shrinkage
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
-from jaxfit.perception.keypoints import BUILTIN_PATH, CropSettings, load_keypoint_detector
+from jaxfit.perception.keypoints import CropSettings, load_keypoint_detector
 from jaxfit.perception.network import OUTPUT, ActivationStatistics, OnnxModel, Segmenter, instance_of
 from jaxfit.perception.segmentation import BUILTIN, LONGER_SIDE_PX, BottomUp, load_segmenter
 
@@ -171,9 +171,8 @@ _OTHER_LAYOUT = "is a network of another layout than that of `jaxfit train"
 
 
 def base_file(which: str, base: str | Path) -> Path:
-    """Return the file of a base network: `builtin`, or an ONNX file."""
-    builtin = {"segmenter": BUILTIN, "keypoints": BUILTIN_PATH}[which]
-    return builtin if str(base) == "builtin" else Path(base)
+    """Return the file in floats of a base network: `builtin`, or an ONNX file."""
+    return BUILTIN.with_name(f"{which}.onnx") if str(base) == "builtin" else Path(base)
 
 
 def load_segmenter_base(path: Path) -> FeaturePyramid:
@@ -407,10 +406,10 @@ def store_training_activations(
         InputError: the file is no such network, or the pictures show fewer than 10 birds.
     """
     count = MAX_PICTURES // len(sources)
-    store_activations(path, _training_inputs(which, path, sources, segmenter, count), count * len(sources), progress)
+    store_activations(path, training_inputs(which, path, sources, segmenter, count), count * len(sources), progress)
 
 
-def _training_inputs(
+def training_inputs(
     which: str, path: str | Path, sources: Sequence[LabelledFrames], segmenter: Segmenter | None, count: int
 ) -> Iterator[np.ndarray]:
     """Yield the inputs of a network for some pictures: whole frames, or the crops of all birds of a frame."""

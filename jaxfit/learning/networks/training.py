@@ -22,6 +22,7 @@ from jaxfit.foundation.files import check_writable, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.reading import reading
 from jaxfit.learning.networks import keypoints, outlines, segmenter
+from jaxfit.learning.networks.eight_bits import INPUTS, SUFFIX, write_eight_bits
 from jaxfit.learning.networks.labelled_frames import load_frames
 from jaxfit.learning.networks.network_files import (
     base_file,
@@ -29,6 +30,7 @@ from jaxfit.learning.networks.network_files import (
     load_keypoint_base,
     load_segmenter_base,
     store_training_activations,
+    training_inputs,
     write_network,
 )
 from jaxfit.learning.networks.networks import FeaturePyramid
@@ -359,7 +361,9 @@ def train_network(
     progress: ProgressTask = silent,
     base: str | Path | None = None,
 ) -> dict[str, float]:
-    """Train a built-in network on simulated frames and write it; the weights differ slightly between processors.
+    """Train a built-in network on simulated frames and write it, in floats and beside them in 8 bits (`eight_bits`).
+
+    The weights differ slightly between processors.
 
     Args:
         which: `segmenter` or `keypoints`.
@@ -404,6 +408,8 @@ def train_network(
     # a keypoint network sees the birds that a segmenter detects
     birds_of = load_segmenter("builtin") if which == "keypoints" else None
     store_training_activations(which, path, [frames], birds_of, progress)
+    inputs = training_inputs(which, path, [frames], birds_of, INPUTS)
+    write_eight_bits(path, inputs, Path(path).with_stem(Path(path).stem + SUFFIX))
     return losses
 
 

@@ -13,6 +13,7 @@ from torch.utils.data import default_collate  # noqa: E402
 from jaxfit.foundation.errors import InputError  # noqa: E402
 from jaxfit.learning.networks import network_files, segmenter, training  # noqa: E402
 from jaxfit.learning.networks.label_data import LabelFiles, prepare_data  # noqa: E402
+from jaxfit.learning.networks.network_files import base_file  # noqa: E402
 from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages  # noqa: E402
 from jaxfit.learning.networks.scenes import film_scenes  # noqa: E402
 from jaxfit.learning.networks.training import (  # noqa: E402
@@ -25,7 +26,7 @@ from jaxfit.learning.networks.training import (  # noqa: E402
     weights_of,
 )
 from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
-from jaxfit.perception.keypoints import BUILTIN_PATH, load_keypoint_detector  # noqa: E402
+from jaxfit.perception.keypoints import load_keypoint_detector  # noqa: E402
 from jaxfit.perception.network import MEAN_KEY, WHITENING_KEY, OnnxModel  # noqa: E402
 from jaxfit.perception.segmentation import load_segmenter  # noqa: E402
 
@@ -161,6 +162,7 @@ def test_trained_segmenter_is_read_back(scenes, tmp_path, monkeypatch):
     assert load_segmenter(tmp_path / "s.onnx").class_names == ("bird",)
     assert model(np.zeros((1, 3, 64, 96), np.float32))["foreground"].shape == (1, 1, 32, 48)
     assert (tmp_path / "s.onnx").stat().st_size < 7e6
+    assert load_segmenter(tmp_path / "s_8bit.onnx").class_names == ("bird",)
 
 
 @pytest.mark.extended
@@ -169,7 +171,7 @@ def test_a_keypoint_network_from_a_base_network_begins_with_its_weights(scenes, 
     still = QUICK._replace(learning_rate=1e-12)
     train_network("keypoints", tmp_path / "k.onnx", Simulation(scenes, 1), still, base="builtin")
     picture = np.random.default_rng(0).uniform(0, 1, (1, 3, 192, 192)).astype(np.float32)
-    networks = [OnnxModel(path) for path in (tmp_path / "k.onnx", BUILTIN_PATH)]
+    networks = [OnnxModel(path) for path in (tmp_path / "k.onnx", base_file("keypoints", "builtin"))]
     np.testing.assert_allclose(*(network(picture)["heatmaps"] for network in networks), atol=2e-3)
     assert networks[0].metadata["background"] == "visible"
     assert load_keypoint_detector(tmp_path / "k.onnx").keypoint_names == MURRE_KEYPOINTS
