@@ -183,7 +183,7 @@ function showKeypoints() {
     list.rows[k + 1].onclick = () => { state.next = k; refresh(); };
   });
   const hint = document.createElement("p");
-  hint.textContent = next >= 0 ? `Click the ${names[next]} of the bird in the film. N goes on without it.` : "All keypoints are labelled. Go to the next frame or bird.";
+  hint.textContent = next >= 0 ? `Click the ${names[next]} of the bird in the film. The wheel zooms. N goes on without it.` : "All keypoints are labelled. Go to the next frame or bird.";
   why.replaceChildren(hint, list);
   why.hidden = false;
   const labelled = new Set((state.corrections?.edits ?? []).map((edit) => /^place (\d+@\d+)/.exec(edit)?.[1]));
