@@ -26,9 +26,9 @@ MAX_WIDTH = 1920
 """Width of the pictures, pixels, at most; wider films are shown in a half, a third and so on of their size."""
 MOST_BYTES = 64_000_000
 """Bytes of pictures in memory, at most."""
-NEAR, AHEAD, BLOCK = 8, 64, 128
-"""Frames that are decoded after a request, and steps back that count as a movement backward; frames that are expected
-in such a movement, and frames that are then decoded at once."""
+NEAR, MOST = 8, 128
+"""Frames that are decoded after a request, and steps back that count as a movement backward; frames that are decoded at
+once after a long movement backward, because a film has to be decoded from a keyframe on."""
 
 
 def is_played(video: Path) -> bool:
@@ -68,8 +68,8 @@ class Pictures:
         self._pictures: OrderedDict[int, bytes | Exception] = OrderedDict()  # those used last are last
         self._asked: list[int] = []
         """Numbers that requests wait for; the newest is last."""
-        self._last, self._by = int(frames[0]), self._step
-        """The number of the newest request, and the step to the next number that is expected."""
+        self._last, self._by, self._moved = int(frames[0]), self._step, 0
+        """The number of the newest request, the step to the next number that is expected, and requests backward."""
         self._reader, self._position = iter(()), -1
         """A reader, and the number of the frame that it reads next."""
         self._changed, self._works = Condition(), False
@@ -85,6 +85,7 @@ class Pictures:
         with self._changed:
             back = 0 < self._last - number <= NEAR * self._step
             self._last, self._by = number, -self._step if back else self._step
+            self._moved = self._moved + 1 if back else 0
             self._asked.append(number)
             if not self._works and self._missing():
                 self._works = True
@@ -104,17 +105,14 @@ class Pictures:
 
     def _missing(self) -> range:
         """Return the numbers to decode next: what the newest request waits for, or else what is expected."""
-        waited = self._waited()
-        expected = range(self._last, self._last + (NEAR if self._by > 0 else AHEAD) * self._by, self._by)
+        waited, count = self._waited(), min(NEAR << self._moved // NEAR, MOST)
+        expected = range(self._last, self._last + count // 2 * self._by, self._by)
         expected = (number for number in expected if number in self._frames and number not in self._pictures)
         number = next(expected, None) if waited is None else waited
         if number is None:
             return range(0)
-        if self._by > 0:
-            return range(number, number + NEAR * self._step, self._step)
-        # a film has to be decoded from a keyframe on, so that pictures in the background are many
-        count = BLOCK if waited is None else NEAR
-        return range(max(number + (count - 1) * self._by, min(self._frames)), number + 1, self._step)
+        last = number + (count - 1) * self._by
+        return range(max(min(number, last), min(self._frames)), max(number, last) + 1, self._step)
 
     def _work(self) -> None:
         """Decode until nothing is missing."""

@@ -176,7 +176,7 @@ def test_film_birds_and_timeline_show_one_moment(page):
     opened, viewer = page
     opened.go(4)
     assert opened.page.input_value("#frame") == str(overlays.FIRST + 4)
-    assert f"frame={overlays.FIRST + 4}" in opened.page.url
+    opened.until(f"location.hash.includes('frame={overlays.FIRST + 4}')")
     check_outline(opened, viewer.results[0], 4)
     assert opened.page.evaluate("jaxfit.state.columns[0].ledge.birds.map((bird) => bird.visible)") == [True, True]
     opened.go(2)  # the second bird has no pose

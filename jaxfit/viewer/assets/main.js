@@ -9,8 +9,8 @@ import { Timeline } from "viewer/timeline";
 /** @typedef {import("viewer/data").Facts} Facts */
 /** @typedef {import("viewer/data").Packed} Packed */
 
-/** How long a moment is shown before its reasons are asked for, milliseconds. */
-const WHY_MS = 120;
+/** How long a moment is shown before its reasons are asked for and the address names it, milliseconds. */
+const REST_MS = 120;
 /** Keypoints that the page lists, from the worst on. */
 const WORST = 7;
 const find = (/** @type {string} */ id) => /** @type {any} */ (document.getElementById(id));
@@ -191,6 +191,9 @@ function showKeypoints() {
   state.timeline?.drawStill(state.selected);
 }
 
+/** The change of the address that waits. */
+let addressed = 0;
+
 function showNumbers() {
   const frame = state.frames[state.i], time = state.times[state.i];
   if (document.activeElement !== find("frame")) find("frame").value = frame;
@@ -202,7 +205,8 @@ function showNumbers() {
     const parts = [`frame=${frame}`];
     if (time !== null) parts.push(`time=${time.toFixed(3)}`);
     if (state.selected.size) parts.push(`birds=${[...state.selected].join(",")}`);
-    history.replaceState(null, "", `#${parts.join("&")}`);
+    clearTimeout(addressed); // browsers allow few changes of the address a second
+    addressed = setTimeout(() => history.replaceState(null, "", `#${parts.join("&")}`), REST_MS);
   }
 }
 
@@ -222,7 +226,7 @@ async function showWhy() {
   explained = pose;
   mark(null);
   why.classList.add("stale");
-  await new Promise((done) => setTimeout(done, WHY_MS)); // the reader may go on
+  await new Promise((done) => setTimeout(done, REST_MS)); // the reader may go on
   if (pose !== explained) return;
   why.hidden = !pose;
   if (!pose) return;
