@@ -1,9 +1,8 @@
 """Networks in 8 bits, which run about twice as fast on a CPU; networks in floats remain the base of a training.
 
-Activations have 8 bits, weights 7: with 8, processors without VNNI saturate sums of two products, and their results
-would differ from those of other processors. The first three and the last convolutions stay in
-floats: all others depend on the first, whose few channels are quick in floats, and the few outputs need the accuracy.
-Last convolutions of one map become one convolution.
+Activations have 8 bits, weights 7: with 8, processors without VNNI saturate sums of two products. The first three and
+the last convolutions stay in floats: all others depend on the first, whose few channels are quick in floats, and the
+few outputs need the accuracy. Last convolutions of one map become one convolution.
 """
 
 # pyright: reportMissingImports=false
