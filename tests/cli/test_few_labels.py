@@ -1,6 +1,7 @@
 """`reconstruct --labels --masks` from end to end: labels of one bird in a few frames, masks of all birds."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -8,8 +9,12 @@ import pytest
 from support.cli_files import rejected
 from support.toy_footage import BIRD, BIRDS, FRAMES, QUICK, SIDE, Footage
 
-from jaxfit import load_solution, read_coco
+from jaxfit import load_solution, pipeline, read_coco
 from jaxfit.cli.main import main
+from jaxfit.config.fit import load_config
+from jaxfit.config.reconstruct import load_reconstruct_config
+from jaxfit.fitting.learn import Learnt
+from jaxfit.model.files import find_bird
 
 FOOTAGE, LABELLED = Footage(), (0, 5, 11)
 
@@ -73,6 +78,24 @@ def test_masks_alone_become_poses(inputs, tmp_path, capsys):
     centre = np.array([np.argwhere(mask).mean(0)[::-1] + 0.5 for mask in (masks[0] for masks in FOOTAGE.masks)])
     middle = solution.keypoints.px[0].mean(1)
     assert np.linalg.norm(middle - centre, axis=-1).max() < 0.2 * SIDE
+
+
+def test_points_beside_those_of_the_model_are_learnt_from_labels_and_not_from_outlines(inputs, tmp_path, monkeypatch):
+    asked = []
+
+    def nothing(_observations, _bird, config, **_options):
+        asked.append(config.learn_weights)
+        return Learnt(replace(config, learn_weights=()), {}, ())
+
+    monkeypatch.setattr(pipeline, "learn_weights", nothing)
+    config = load_reconstruct_config(inputs / "quick.yaml")
+    others = replace(config.fit, learn_weights=load_config("few_labels").learn_weights)
+    for labels in (inputs / "labels.csv", None):
+        out = tmp_path / ("labels" if labels else "masks")
+        given = {"labels": labels, "masks": inputs / "masks", "fit_of_others": others}
+        pipeline.reconstruct(inputs / "frames", out, find_bird(inputs / "toy.npz"), config, **given)
+        assert (out / "learnt.yaml").exists() == bool(labels)
+    assert asked == [("keypoint_offsets",)]
 
 
 def test_labels_of_another_film(inputs, tmp_path, capsys):
