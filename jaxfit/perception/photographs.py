@@ -23,7 +23,7 @@ from jaxfit.perception.detections import (
 )
 from jaxfit.perception.segmenter_choice import FRAMES, with_chosen_segmenter
 from jaxfit.perception.track import TrackingResult
-from jaxfit.perception.tracking import RecordedFrame, record_frame
+from jaxfit.perception.tracking import RecordedFrame, all_distances, record_frame
 from jaxfit.perception.trust import footage_signals, judge
 from jaxfit.video.pictures import image_files, read_picture
 
@@ -92,11 +92,7 @@ def track_photographs(
     if empty:
         _logger.warning("no bird in %s", ", ".join([*empty[:10], *(["…"] if len(empty) > 10 else [])]))
     observations = _observations(records, keypoints.keypoint_names)
-    distances = [
-        np.concatenate([np.zeros(0), *(getattr(record, name) for record in records)]).tolist()
-        for name in ("segmenter_distance", "keypoint_distance")
-    ]
-    signals = footage_signals(observations, {}, distances, getattr(keypoints, "curve", None) is not None)
+    signals = footage_signals(observations, {}, all_distances(records), getattr(keypoints, "curve", None) is not None)
     failure = None
     if not observations.num_tracks:
         remedy = "use another --segmenter (`jaxfit networks get general` for birds of any species), or draw masks"

@@ -38,6 +38,7 @@ from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segm
 from jaxfit.perception.tracking import (
     RecordedFrame,
     Tracker,
+    all_distances,
     load_tracker,
     observations_of,
 )
@@ -195,10 +196,7 @@ def run_tracking(
     ids = all_tracks.track_id
     short_tracks = dict(zip(ids[is_short].tolist(), length[is_short].tolist(), strict=True))
     low_score_tracks = dict(zip(ids[is_low].tolist(), score[is_low].tolist(), strict=True))
-    distances = [
-        np.concatenate([record.segmenter_distance for record in records]).tolist(),
-        np.concatenate([record.keypoint_distance for record in records]).tolist(),
-    ]
+    distances = all_distances(records)
     # an outline leaves much open, so the limit for confidences of the built-in network does not hold
     calibrated = getattr(keypoints, "curve", None) is not None and not sees_outlines
     trust = judge(footage_signals(all_tracks, short_tracks, distances, calibrated))

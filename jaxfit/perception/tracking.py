@@ -195,6 +195,12 @@ def record_frame(
     )
 
 
+def all_distances(frames: Sequence[RecordedFrame]) -> list[list[float]]:
+    """Return the distances of the activations in all frames: those of the segmenter, and of the keypoint network."""
+    pairs = [(frame.segmenter_distance, frame.keypoint_distance) for frame in frames]
+    return [[number for pair in pairs for number in pair[i].tolist()] for i in (0, 1)]
+
+
 def observations_of(
     frames: Sequence[RecordedFrame],
     names: Sequence[str],

@@ -99,11 +99,15 @@ def read_frames(
         InputError: the path does not exist, is not a readable video, has no video stream or has no readable image; or
             fps is given for a file. During reading: no frame can be decoded, or an image has another size.
     """
-    return FrameReader(path, start, stop, step, fps=fps, part=part)
+    if start < 0 or (stop is not None and stop < 0) or step < 1:
+        raise ValueError(f"start and stop must be 0 or more and step 1 or more, not {start}, {stop}, {step}")
+    if fps is not None and not 0 < fps < float("inf"):
+        raise ValueError(f"fps must be positive and finite, not {fps}")
+    return FrameReader(path, range(start, sys.maxsize if stop is None else stop, step), fps, part)
 
 
 class FrameReader:
-    """Iterates over frames and lists the skipped frames. ``read_frames`` makes readers and documents the arguments.
+    """Iterates over frames and lists the skipped frames. ``read_frames`` makes and documents readers.
 
     Every iteration reads the video again. A thread decodes a few frames ahead, so the memory does not depend on the
     length of the video. The thread ends with the iteration. The iteration raises the exceptions of the thread.
@@ -114,25 +118,12 @@ class FrameReader:
     damaged: list[int]
     """Numbers of the requested frames that were skipped so far. Complete after an iteration."""
 
-    def __init__(
-        self,
-        path: str | Path,
-        start: int = 0,
-        stop: int | None = None,
-        step: int = 1,
-        *,
-        fps: float | None = None,
-        part: int = 1,
-    ):
-        if start < 0 or (stop is not None and stop < 0) or step < 1:
-            raise ValueError(f"start and stop must be 0 or more and step 1 or more, not {start}, {stop}, {step}")
-        if fps is not None and not 0 < fps < float("inf"):
-            raise ValueError(f"fps must be positive and finite, not {fps}")
+    def __init__(self, path: str | Path, numbers: range, fps: float | None, part: int):
         self.path = _existing(path)
         self.info = probe_video(self.path, fps=fps)
         self.damaged = []
         self._part = part
-        self._numbers = range(start, sys.maxsize if stop is None else stop, step)
+        self._numbers = numbers
 
     def __iter__(self) -> Iterator[Frame]:
         self.damaged = []

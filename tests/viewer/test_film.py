@@ -1,4 +1,4 @@
-"""Pictures of the film: the frames that are asked for, in any order and from several threads."""
+"""Pictures of the film: the requested frames, in any order and from several threads."""
 
 from concurrent.futures import ThreadPoolExecutor
 

@@ -111,7 +111,7 @@ class Opened:
                     pictures, [*pictures[1:], (pictures[-1][0] + 1, b"")], strict=True
                 ):
                     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-                    for _ in range(min(round(10 * (next_s - time_s)), 20)):  # nobody watches a fit for long
+                    for _ in range(min(round(10 * (next_s - time_s)), 20)):  # a short film: a fit shows little
                         film.write(picture)
 
         session.on("Page.screencastFrame", keep)

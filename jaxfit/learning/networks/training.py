@@ -361,7 +361,7 @@ def train_network(
     progress: ProgressTask = silent,
     base: str | Path | None = None,
 ) -> dict[str, float]:
-    """Train a built-in network on simulated frames and write it, in floats and beside them in 8 bits (`eight_bits`).
+    """Train a built-in network on simulated frames and write two files: in floats, and in 8 bits (`eight_bits`).
 
     The weights differ slightly between processors.
 
