@@ -1,6 +1,7 @@
 """A video of three toy birds side by side, and stand-ins for networks that report the truth."""
 
 import functools
+import threading
 
 import cv2
 import numpy as np
@@ -106,19 +107,18 @@ class TrueKeypoints:
 
 
 class Monitored:
-    """A part of a network whose activations have the number of the frame as distance."""
+    """A part of a network whose activations have the number of the frame as distance, for every thread separately."""
 
     def __init__(self, *given):
         super().__init__(*given)
-        self.activations, self.distances = self, []
+        self.activations, self.of_thread = self, threading.local()
 
     def __call__(self, frame, *instances):
-        self.distances.append(float(frame[0, 0, 0]))
+        self.of_thread.distances = [*getattr(self.of_thread, "distances", []), float(frame[0, 0, 0])]
         return super().__call__(frame, *instances)
 
     def take(self):
-        taken, self.distances = np.array(self.distances), []
-        return taken
+        return np.array(self.of_thread.__dict__.pop("distances", []))
 
 
 class MonitoredSegmenter(Monitored, TrueSegmenter):

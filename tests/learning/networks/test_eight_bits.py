@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
-onnx = pytest.importorskip("onnx", reason="needs the extra `train`")
+pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
-from onnx import helper, numpy_helper  # noqa: E402
-from support.onnx_graphs import write_graph  # noqa: E402
+import onnx
+from onnx import helper, numpy_helper
+from support.onnx_graphs import write_graph
 
-from jaxfit.learning.networks import eight_bits  # noqa: E402
-from jaxfit.learning.networks.eight_bits import write_eight_bits  # noqa: E402
-from jaxfit.perception.keypoints import BUILTIN_PATH  # noqa: E402
-from jaxfit.perception.network import OnnxModel  # noqa: E402
-from jaxfit.perception.segmentation import BUILTIN  # noqa: E402
+from jaxfit.learning.networks import eight_bits
+from jaxfit.learning.networks.eight_bits import write_eight_bits
+from jaxfit.perception.keypoints import BUILTIN_PATH
+from jaxfit.perception.network import OnnxModel
+from jaxfit.perception.segmentation import BUILTIN
 
 
 @pytest.fixture
