@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import logging
-import os
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,6 +16,7 @@ from jaxfit.config.checks import require
 from jaxfit.config.perception import AUTO, BUILTIN, OUTLINE, FramesConfig, TrackConfig
 from jaxfit.foundation.errors import one_line
 from jaxfit.foundation.progress import Clock
+from jaxfit.foundation.threads import MAX_AT_ONCE, in_threads, usable_cores
 from jaxfit.foundation.unfinished import Parts
 from jaxfit.perception.general_networks import DETECTORS
 from jaxfit.perception.keypoints import keypoint_file, load_keypoint_detector
@@ -29,9 +27,6 @@ from jaxfit.video.decoding import Frame
 from jaxfit.video.reader import FrameReader
 
 _logger = logging.getLogger(__name__)
-
-A = TypeVar("A")
-B = TypeVar("B")
 
 
 def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segmenter:
@@ -135,29 +130,9 @@ class FrameDetections(NamedTuple):
     """None where another process has read the picture."""
 
 
-MAX_FRAMES_AT_ONCE = 8
-"""Largest number of frames on which the networks run at the same time, to bound the memory."""
-
-
 def frames_at_once(config: TrackConfig) -> int:
     """Return the number of frames on which the networks run at the same time: one for each core."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return min(config.threads or cores or 1, MAX_FRAMES_AT_ONCE)
-
-
-def in_threads(function: Callable[[A], B], items: Iterable[A], at_once: int) -> Generator[B]:
-    """Yield the results of all items in their order; threads compute `at_once` results at the same time."""
-    waiting: deque[Future[B]] = deque()
-    with ThreadPoolExecutor(at_once, "detect") as pool:
-        try:
-            for item in items:
-                if len(waiting) == at_once:
-                    yield waiting.popleft().result()
-                waiting.append(pool.submit(function, item))
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+    return min(config.threads or usable_cores(), MAX_AT_ONCE)
 
 
 def detect(

@@ -12,10 +12,10 @@ from jaxfit.config.perception import TrackConfig
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import Clock, ProgressTask, silent
+from jaxfit.foundation.threads import in_threads
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.perception.detections import (
     frames_at_once,
-    in_threads,
     open_keypoint_detector,
     open_segmenter,
     single_opencv_thread,

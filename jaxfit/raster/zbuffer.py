@@ -306,8 +306,17 @@ def vertex_normals(
         ValueError: the shape of an argument is not as described.
     """
     vertices, faces = _checked(vertices, faces)
-    corners = vertices[..., faces, :]
-    doubled = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+    return _vertex_normals(vertices, faces, _face_normals(vertices, faces))
+
+
+def _face_normals(vertices: Float[np.ndarray, "*B V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "*B F 3"]:
+    """Return the normals of the faces; their lengths are twice the areas."""
+    corners = np.take(vertices, faces, axis=-2)  # several times as fast as an index
+    return np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+
+
+def _vertex_normals(vertices: np.ndarray, faces: np.ndarray, doubled: np.ndarray) -> np.ndarray:
+    """Return `vertex_normals` from the normals of the faces."""
     batch, count = vertices.shape[:-2], vertices.shape[-2]
     flat = doubled.reshape(math.prod(batch), len(faces), 3)
     sums = np.zeros((len(flat), count, 3))
@@ -353,9 +362,9 @@ def shade(
         raise ValueError(f"light: expected a finite direction (3,) other than 0, got {light!r}")
     if not 0 <= ambient <= 1:
         raise ValueError(f"ambient: expected a fraction in [0, 1], got {ambient!r}")
-    corners = (vertices - vertices.mean(0))[faces]
-    volume = np.sum(np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2])
-    normals = vertex_normals(vertices, faces) * (-1 if volume < 0 else 1)
+    doubled = _face_normals(vertices, faces)
+    volume = np.sum((np.take(vertices, faces[:, 0], axis=0) - vertices.mean(0)) * doubled)
+    normals = _vertex_normals(vertices, faces, doubled) * (-1 if volume < 0 else 1)
     sky = (3 - normals[:, 1:2]) / 4
     sun = ((1 + normals @ (towards / np.linalg.norm(towards)))[:, None] / 2) ** 2
     return np.clip(colours * (ambient * sky + (1 - ambient) * sun), 0, 1).astype(np.float32)

@@ -96,12 +96,8 @@ def draw_birds(
     height, width = image.shape[:2]
     for group in _rendered(birds, faces, (width, height), one_camera):
         box = image[group.low[1] : group.high[1], group.low[0] : group.high[0]]
-        seen = group.coverage > 0
-        box[seen] = (
-            box[seen] * (1 - style.opacity * group.coverage[seen][:, None])
-            + 255 * style.opacity * group.values[seen]
-            + 0.5
-        ).astype(np.uint8)
+        footage = box * (1 - style.opacity * group.coverage)[..., None]
+        box[:] = footage + 255 * style.opacity * group.values + 0.5
         for i in reversed(range(len(group.birds))):
             edges = _edges(group, i)
             cv2.drawContours(box, edges, -1, track_colour(group.birds[i].position), style.line_px, cv2.LINE_AA)
@@ -139,12 +135,13 @@ def _rendered(
     one_camera: bool,
     samples: int = 2,
 ) -> Iterator[_Rendered]:
-    width, height = size_px
-    for group in _overlapping(birds, width, height):
-        members = sorted((birds[i] for i in group), key=lambda bird: -float(bird.screen[:, 1].max()))
-        low = np.clip(np.floor(np.min([b.screen[:, :2].min(0) for b in members], 0)) - 2, 0, None).astype(int)
-        high = np.ceil(np.max([b.screen[:, :2].max(0) for b in members], 0)) + 2
-        high = np.minimum(high, [width, height]).astype(int)
+    columns = [np.ascontiguousarray(bird.screen[:, :2].T) for bird in birds]  # NumPy is slow along the first axis
+    lows, highs = (np.array([f.reduce(c, axis=1) for c in columns]) for f in (np.minimum, np.maximum))
+    for group in _overlapping(lows, highs, size_px):
+        nearest = sorted(group, key=lambda i: -highs[i, 1])
+        members = [birds[i] for i in nearest]
+        low = np.clip(np.floor(lows[group].min(0)) - 2, 0, None).astype(int)
+        high = np.minimum(np.ceil(highs[group].max(0)) + 2, size_px).astype(int)
         meshes = [b.screen - np.array([*low, 0], np.float32) for b in members]
         if not one_camera:
             meshes = [_layer(mesh, rank) for rank, mesh in enumerate(meshes)]
@@ -175,21 +172,18 @@ def _layer(mesh: Float[np.ndarray, "V 3"], rank: int) -> Float[np.ndarray, "V 3"
     return np.column_stack([mesh[:, :2], layered]).astype(np.float32)
 
 
-def _overlapping(birds: Sequence[DrawnBird], width: int, height: int) -> list[list[int]]:
-    """Return the positions of birds in groups with overlapping boxes; birds outside the image are skipped."""
-    boxes = [(b.screen[:, :2].min(0), b.screen[:, :2].max(0)) for b in birds]
-    inside = [
-        i
-        for i, (low, high) in enumerate(boxes)
-        if np.isfinite([low, high]).all() and (high > 0).all() and (low < [width, height]).all()
-    ]
+def _overlapping(
+    lows: Float[np.ndarray, "N 2"], highs: Float[np.ndarray, "N 2"], size_px: tuple[int, int]
+) -> list[list[int]]:
+    """Return the positions of boxes in groups that overlap or almost touch; boxes outside the image are skipped."""
+    if not len(lows):
+        return []
+    inside = (np.isfinite(lows) & np.isfinite(highs) & (highs > 0) & (lows < size_px)).all(1)
+    before = np.all(lows[:, None] <= highs + 4, axis=-1)
+    near = before & before.T
     groups: list[list[int]] = []
-    for i in inside:
-        meets = [
-            g
-            for g in groups
-            if any((boxes[i][0] <= boxes[j][1] + 4).all() and (boxes[j][0] <= boxes[i][1] + 4).all() for j in g)
-        ]
+    for i in np.flatnonzero(inside).tolist():
+        meets = [g for g in groups if near[i, g].any()]
         groups = [g for g in groups if g not in meets] + [[i, *(j for g in meets for j in g)]]
     return groups
 
@@ -204,13 +198,11 @@ def draw_keypoints(
     if (high > low).all():
         box = image[low[1] : high[1], low[0] : high[0]]
         lined = box.copy()
-        for a, b in pairs:
-            line(lined, points[a] - low, points[b] - low, FITTED, max(1, round(0.7 * style.unit)))
+        first, second = np.array(pairs, int).reshape(-1, 2).T
+        line(lined, points[first] - low, points[second] - low, FITTED, max(1, round(0.7 * style.unit)))
         cv2.addWeighted(lined, 0.6, box, 0.4, 0, dst=box)
-    for point in bird.detected_px:
-        ring(image, point, max(2.2 * radius, 3.2), DETECTED, max(1, round(0.6 * radius)))
-    for point in points:
-        dot(image, point, radius, FITTED)
+    ring(image, bird.detected_px, max(2.2 * radius, 3.2), DETECTED, max(1, round(0.6 * radius)))
+    dot(image, points, radius, FITTED)
 
 
 def regions_95(
@@ -244,6 +236,21 @@ def draw_regions(image: UInt8[np.ndarray, "H W 3"], bird: DrawnBird, style: Styl
         closed_curve(image, bird.regions_px[k], track_colour(bird.position))
 
 
+class Number(NamedTuple):
+    """The place of the number of a bird; positions in image pixels."""
+
+    bird: DrawnBird
+    head: Float[np.ndarray, "2"]
+    left: float
+    middle: Float[np.ndarray, "2"]
+
+    def draw(self, image: UInt8[np.ndarray, "H W 3"], style: Style) -> None:
+        """Draw the number, and a line from the head to the number."""
+        colour = track_colour(self.bird.position)
+        line(image, self.head, self.middle, colour, style.line_px)
+        tag(image, self.bird.name, self.left, self.middle[1], style.text_px, colour)
+
+
 class Numbers:
     """Places the number of each bird near its head, away from other numbers and birds, and steady over frames."""
 
@@ -252,17 +259,19 @@ class Numbers:
         self._head, self._style = named[0] if named else None, style
         self._last: dict[int, int] = {}
 
-    def draw(self, image: UInt8[np.ndarray, "H W 3"], birds: Sequence[DrawnBird]) -> None:
-        """Draw the numbers of all birds of a frame into the image."""
+    def place(self, size_px: tuple[int, int], birds: Sequence[DrawnBird]) -> list[Number]:
+        """Return the places of the numbers of all birds in an image of this width and height.
+
+        Frames must be placed in increasing order.
+        """
         if not birds:
-            return
-        height, width = image.shape[:2]
-        size, taken = self._style.text_px, np.zeros((0, 4))
+            return []
+        size, taken, placed = self._style.text_px, np.zeros((0, 4)), []
         points = np.concatenate([bird.keypoints_px for bird in birds])
         for bird in birds:
             top = bird.screen[bird.screen[:, 1].argmin(), :2]
             head = top if self._head is None else bird.keypoints_px[self._head]
-            if not ((head > 0) & (head < [width, height])).all():
+            if not ((head > 0) & (head < size_px)).all():
                 continue
             half = np.array([text_width(bird.name, size) / 2 + 0.45 * size, 0.85 * size])
             ahead = head - bird.screen[:, :2].mean(0)
@@ -270,7 +279,7 @@ class Numbers:
             places = head + np.outer(_REACHES, [size, size]).repeat(len(_TURNS), 0) * np.tile(
                 np.column_stack([np.cos(angle), np.sin(angle)]), (len(_REACHES), 1)
             )
-            places = np.clip(places, half + 1, [width, height] - half - 1)
+            places = np.clip(places, half + 1, size_px - half - 1)
             plates = np.concatenate([places - half, places + half], axis=1)
             low, high = plates[:, None, :2], plates[:, None, 2:]
             cost = ((points > low - 2) & (points < high + 2)).all(-1).sum(1) + 0.25 * np.arange(len(plates))
@@ -279,8 +288,8 @@ class Numbers:
                 cost[self._last[bird.position]] -= 3
             best = self._last[bird.position] = int(cost.argmin())
             taken = np.concatenate([taken, plates[best : best + 1]])
-            line(image, head, places[best], track_colour(bird.position), self._style.line_px)
-            tag(image, bird.name, plates[best, 0], places[best, 1], size, track_colour(bird.position))
+            placed.append(Number(bird, head, plates[best, 0], places[best]))
+        return placed
 
 
 class Detected:

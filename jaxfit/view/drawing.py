@@ -14,42 +14,38 @@ from jaxfit.view.colours import INK, Colour
 SHIFT = 4  # OpenCV draws in units of 1/16 pixel; pixel centres are whole numbers in OpenCV, halves in jaxfit
 
 
-def fixed(point_px: Float[np.ndarray, "2"] | tuple[float, float]) -> tuple[int, int]:
-    """Convert a position in image pixels to OpenCV's fixed-point numbers with `SHIFT`."""
-    x, y = _fixed(point_px).tolist()
-    return x, y
-
-
 def _fixed(points_px) -> Int[np.ndarray, "..."]:
+    """Convert positions in image pixels to OpenCV's fixed-point numbers with `SHIFT`."""
     return np.clip(np.round((np.asarray(points_px, np.float64) - 0.5) * (1 << SHIFT)), -(2**19), 2**19).astype(np.int32)
 
 
-def dot(image: UInt8[np.ndarray, "H W 3"], point_px, radius: float, colour: Colour, edge: Colour | None = INK) -> None:
-    """Draw a filled circle with a thin edge."""
-    at = fixed(point_px)
-    if edge is not None:
-        cv2.circle(image, at, round((radius + 0.8) * (1 << SHIFT)), edge, -1, cv2.LINE_AA, SHIFT)
-    cv2.circle(image, at, round(radius * (1 << SHIFT)), colour, -1, cv2.LINE_AA, SHIFT)
+def dot(image: UInt8[np.ndarray, "H W 3"], points_px, radius: float, colour: Colour, edge: Colour | None = INK) -> None:
+    """Draw a filled circle with a thin edge at a position, or at (…, 2) positions."""
+    for at in _fixed(points_px).reshape(-1, 2).tolist():
+        if edge is not None:
+            cv2.circle(image, at, round((radius + 0.8) * (1 << SHIFT)), edge, -1, cv2.LINE_AA, SHIFT)
+        cv2.circle(image, at, round(radius * (1 << SHIFT)), colour, -1, cv2.LINE_AA, SHIFT)
 
 
 def ring(
     image: UInt8[np.ndarray, "H W 3"],
-    point_px,
+    points_px,
     radius: float,
     colour: Colour,
     width: int = 1,
     edge: Colour | None = INK,
 ) -> None:
-    """Draw a circle with an edge on both sides, so that it contrasts with any background."""
-    at = fixed(point_px)
-    if edge is not None:
-        cv2.circle(image, at, round(radius * (1 << SHIFT)), edge, width + 1, cv2.LINE_AA, SHIFT)
-    cv2.circle(image, at, round(radius * (1 << SHIFT)), colour, width, cv2.LINE_AA, SHIFT)
+    """Draw a circle with an edge on both sides, so that it contrasts with any background; positions as for `dot`."""
+    for at in _fixed(points_px).reshape(-1, 2).tolist():
+        if edge is not None:
+            cv2.circle(image, at, round(radius * (1 << SHIFT)), edge, width + 1, cv2.LINE_AA, SHIFT)
+        cv2.circle(image, at, round(radius * (1 << SHIFT)), colour, width, cv2.LINE_AA, SHIFT)
 
 
 def line(image: UInt8[np.ndarray, "H W 3"], a_px, b_px, colour: Colour, width: int = 1) -> None:
-    """Draw a straight line between two positions in pixels."""
-    cv2.line(image, fixed(a_px), fixed(b_px), colour, width, cv2.LINE_AA, SHIFT)
+    """Draw straight lines between positions in pixels, (…, 2) each."""
+    ends = _fixed(np.stack([a_px, b_px], axis=-2)).reshape(-1, 2, 2)
+    cv2.polylines(image, list(ends), False, colour, width, cv2.LINE_AA, SHIFT)
 
 
 def closed_curve(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from jaxfit.data.tracks import frame_step
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.foundation.threads import in_threads, usable_cores
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
 from jaxfit.raster.zbuffer import shade
@@ -29,6 +31,7 @@ from jaxfit.video.writer import SLOWEST_FPS, VideoWriter
 from jaxfit.view.birds import (
     Detected,
     DrawnBird,
+    Number,
     Numbers,
     Style,
     draw_birds,
@@ -216,17 +219,25 @@ def overlay(
     fps = (info.fps or FOLDER_FPS) / step
     wanted = [pair for row in sheet_pairs(solution) for pair in row]
     tiles = {}
-    with (
-        VideoWriter(out, drawing.size_px, max(fps, SLOWEST_FPS), codec) as writer,
-        progress("overlay", (last - first) // step + 1) as report_progress,
-    ):
-        number = None
+
+    def frames() -> Iterator[_Frame]:
         for number, picture, time_s in read_frames(video, first, last + 1, step):
             t = int(np.searchsorted(numbers, number))
             here = t if numbers[t] == number else None
-            tiles |= cut_tiles(drawing.posed, picture, [(n, at) for n, at in wanted if at == here])
-            seconds = number / (fps * step) if time_s is None else time_s
-            writer.write(drawing.frame(picture, number, here, seconds))
+            tiles.update(cut_tiles(drawing.posed, picture, [(n, at) for n, at in wanted if at == here]))
+            yield drawing.prepare(picture, number, here, number / (fps * step) if time_s is None else time_s)
+
+    def drawn(frame: _Frame) -> tuple[int, UInt8[np.ndarray, "H W 3"]]:
+        return frame.number, drawing.draw(frame)
+
+    with (
+        VideoWriter(out, drawing.size_px, max(fps, SLOWEST_FPS), codec) as writer,
+        progress("overlay", (last - first) // step + 1) as report_progress,
+        closing(in_threads(drawn, frames(), usable_cores())) as images,
+    ):
+        number = None
+        for number, image in images:
+            writer.write(image)
             report_progress(1, f"frame {number}")
         if number is None or (info.frames is None and number != last and not force):
             raise too_short(video, solution, (info.frames or 0) if number is None else number + 1)
@@ -325,11 +336,26 @@ def overlay_pictures(
             raise too_short(video, solution, 0)
         number, picture, time_s = found
         t = int(np.searchsorted(solution.frame_index, number))
-        yield number, drawing.frame(picture, number, t, number / FOLDER_FPS if time_s is None else time_s)
+        seconds = number / FOLDER_FPS if time_s is None else time_s
+        yield number, drawing.draw(drawing.prepare(picture, number, t, seconds))
+
+
+class _Frame(NamedTuple):
+    """What is drawn in a frame."""
+
+    picture: UInt8[np.ndarray, "H W 3"]
+    number: int
+    t: int | None
+    """Position in the result; None if the result lacks the frame."""
+    seconds: float
+    birds: list[DrawnBird]
+    tags: list[Number]
+    meshes_cam: list[Float[np.ndarray, "V 3"]]
+    """Meshes of all tracks, for the side views; empty without them."""
 
 
 class _Drawing:
-    """Draws the frames of an overlay, in increasing order."""
+    """Draws the frames of an overlay: `prepare` in increasing order, `draw` in any order and thread."""
 
     def __init__(
         self,
@@ -369,25 +395,35 @@ class _Drawing:
         self.size_px = self.picture_px[0], self.picture_px[1] + self._legend.height + strip
         self._start, self._cam = 0, np.zeros((0, 0, 0, 3), np.float32)
 
-    def frame(
-        self, picture: UInt8[np.ndarray, "H W 3"], number: int, t: int | None, seconds: float
-    ) -> UInt8[np.ndarray, "H2 W2 3"]:
-        """Return the drawn image of a frame; `t` is the position in the result, None if the result lacks the frame."""
-        image = picture.copy() if self.zoom == 1 else cv2.resize(picture, self.picture_px, interpolation=self._shrink)
-        shown = np.zeros(len(self.solution.track_id), bool) if t is None else self.solution.valid[:, t]
-        birds = [] if t is None else [self._bird(n, t) for n in np.flatnonzero(shown).tolist()]
-        crops = self.solution.crops.square_px[shown, t] if t is not None else np.zeros((0, 3))
-        draw_birds(image, birds, self._faces, self.style, one_camera=bool((crops == crops[:1]).all()))
-        for bird in birds:
-            draw_regions(image, bird, self.style)
-        for bird in birds:
-            draw_keypoints(image, bird, self._pairs, self.style)
-        self._numbers.draw(image, birds)
-        parts = [image, self._legend.draw(number, seconds)]
+    def prepare(self, picture: UInt8[np.ndarray, "H W 3"], number: int, t: int | None, seconds: float) -> _Frame:
+        """Return what is drawn in a frame; `t` is the position in the result, None if the result lacks the frame."""
+        birds = [] if t is None else [self._bird(n, t) for n in np.flatnonzero(self.solution.valid[:, t]).tolist()]
+        tags, meshes = self._numbers.place(self.picture_px, birds), []
+        if self._side is not None and t is not None:
+            meshes = [self._vertices_cam(n, t) for n in range(len(self.solution.track_id))]
+        return _Frame(picture, number, t, seconds, birds, tags, meshes)
+
+    def draw(self, frame: _Frame) -> UInt8[np.ndarray, "H2 W2 3"]:
+        """Return the image of a frame."""
+        image = np.empty((self.size_px[1], self.size_px[0], 3), np.uint8)
+        low = self.picture_px[1]
+        if self.zoom == 1:
+            image[:low] = frame.picture
+        else:
+            image[:low] = cv2.resize(frame.picture, self.picture_px, interpolation=self._shrink)
+        shown = np.zeros(len(self.solution.track_id), bool) if frame.t is None else self.solution.valid[:, frame.t]
+        crops = np.zeros((0, 3)) if frame.t is None else self.solution.crops.square_px[shown, frame.t]
+        draw_birds(image[:low], frame.birds, self._faces, self.style, one_camera=bool((crops == crops[:1]).all()))
+        for bird in frame.birds:
+            draw_regions(image[:low], bird, self.style)
+        for bird in frame.birds:
+            draw_keypoints(image[:low], bird, self._pairs, self.style)
+        for each in frame.tags:
+            each.draw(image[:low], self.style)
+        image[low : low + self._legend.height] = self._legend.draw(frame.number, frame.seconds)
         if self._side is not None:
-            meshes = [self._vertices_cam(n, t) for n in range(len(shown))] if t is not None else []
-            parts.append(self._side.draw(t or 0, shown, meshes))
-        return np.vstack(parts)
+            image[low + self._legend.height :] = self._side.draw(frame.t or 0, shown, frame.meshes_cam)
+        return image
 
     def _bird(self, n: int, t: int) -> DrawnBird:
         cam, span = self._vertices_cam(n, t), slice(t, t + 1)

@@ -12,9 +12,9 @@ from support.toy_footage import BIRD, BIRDS, FRAMES, SIDE, Footage, TrueKeypoint
 from jaxfit.config.perception import FramesConfig, KeypointsConfig, SegmenterConfig, TrackConfig, TrackerConfig
 from jaxfit.data.observations import FROM_OUTLINE
 from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.threads import in_threads
 from jaxfit.model.anatomy import AVES_KEYPOINTS
 from jaxfit.perception import track
-from jaxfit.perception.detections import in_threads
 from jaxfit.perception.network import OUTPUT, ActivationMonitor, ActivationStatistics
 from jaxfit.perception.track import open_segmenter, run_tracking, track_video
 from jaxfit.video.writer import VideoWriter
