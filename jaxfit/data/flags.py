@@ -19,15 +19,14 @@ Source: Iglewicz and Hoaglin 1993, *How to detect and handle outliers* (modified
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
 
+from jaxfit.data.formats.rle import foreground_runs
 from jaxfit.data.mask_comparison import compare_masks
-from jaxfit.data.masks import box_of_rle, decode_mask
 from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.solution import Solution
 from jaxfit.foundation.progress import ProgressTask, silent
@@ -112,31 +111,62 @@ def contradict_masks(
     contradicts = np.zeros(observations.present.shape, bool)
     compared = [(n, t) for n, t in cells.tolist() if (n, t) in observations.masks]
     with progress("Comparing keypoints with masks", len(compared)) as report_progress:
-        for n, t in compared:
-            sure_px = observations.keypoints_px[n, t, observations.confidence[n, t] >= MIN_CONFIDENCE]
-            limit_px = WRONG_SHARE * float(observations.box_px[n, t, 2:].max())
-            if len(sure_px):
-                outside = _distances_px(sure_px, observations.masks[n, t], limit_px) > limit_px
-                contradicts[n, t] = outside.mean() > OUTSIDE_SHARE
-            report_progress(1, "")
+        for some in (compared[i : i + _MASKS] for i in range(0, len(compared), _MASKS)):
+            contradicts[tuple(np.transpose(some))] = _contradict(observations, some)
+            report_progress(len(some), "")
     return contradicts
 
 
+_MASKS = 1000
+"""Masks that are compared at once, which bounds the memory."""
+
+
+def _contradict(observations: Observations, cells: Sequence[tuple[int, int]]) -> Bool[np.ndarray, "D"]:
+    """Return whether the keypoints of D birds with masks contradict their masks."""
+    index = tuple(np.transpose(cells))
+    masks = [observations.masks[cell] for cell in cells]
+    runs, bird = foreground_runs(masks), np.arange(len(masks))[:, None]
+    height, width = np.array([mask["size"] for mask in masks]).T[..., None]
+    column, row = np.moveaxis(np.floor(observations.keypoints_px[index]).astype(int), -1, 0)
+    sure = observations.confidence[index] >= MIN_CONFIDENCE
+    pixel, after_all = column * height + row, int((height * width).max()) + 1
+    run = np.searchsorted(runs.mask * after_all + runs.pixels[:, 0], bird * after_all + pixel, side="right") - 1
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    inside &= (run >= 0) & (runs.mask[run] == bird) & (pixel < runs.pixels[run, 1]) if len(runs.mask) else False
+    beside = sure & ~inside
+
+    def too_many(outside: Bool[np.ndarray, "D K"]) -> Bool[np.ndarray, "D"]:
+        return outside.sum(1) / np.maximum(sure.sum(1), 1) > OUTSIDE_SHARE
+
+    limit_px = WRONG_SHARE * observations.box_px[index][:, 2:].max(1).astype(np.float64)
+    starts = np.searchsorted(runs.mask, np.arange(len(masks) + 1))
+    for d in np.flatnonzero(too_many(beside)).tolist():  # the keypoints of most birds lie in their masks
+        own = runs.pixels[starts[d] : starts[d + 1]]
+        k = np.flatnonzero(beside[d])
+        if len(own):
+            distance_px = _distances_px(column[d, k], row[d, k], own, int(height[d, 0]))
+            beside[d, k] = distance_px > float(limit_px[d])
+        else:
+            beside[d] = False  # an empty mask says nothing
+    return too_many(beside)
+
+
 def _distances_px(
-    points_px: Float[np.ndarray, "M 2"], rle: Mapping[str, Any], reach_px: float
+    column: Int[np.ndarray, "M"], row: Int[np.ndarray, "M"], runs: Int[np.ndarray, "R 2"], height: int
 ) -> Float[np.ndarray, "M"]:
-    """Return the distance of points to a mask in pixels; larger distances than `reach_px` are not exact."""
-    box = box_of_rle(rle)
-    if box is None:
-        return np.zeros(len(points_px))  # an empty mask says nothing
-    margin = int(reach_px) + 2
-    x0, y0, width, height = box
-    inside = decode_mask(rle, (x0, x0 + width))[y0 : y0 + height, x0 : x0 + width]
-    background = np.pad(~inside, margin, constant_values=True).astype(np.uint8)
-    distance = cv2.distanceTransform(background, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    at = np.floor(points_px).astype(int) - (x0 - margin, y0 - margin)
-    column, row = np.clip(at, 0, np.array(distance.shape[::-1]) - 1).T  # the border is beyond `reach_px`
-    return distance[row, column]
+    """Return the distances of pixels to the nearest pixel of a mask.
+
+    Args:
+        column, row: the pixels, which may lie outside the image.
+        runs: the pixels of the mask, as `MaskRuns.pixels`.
+        height: height of the image.
+    """
+    first, last = runs[:, 0] // height, (runs[:, 1] - 1) // height
+    count = last - first + 1  # a run may reach into further columns
+    at = np.repeat(first - np.cumsum(count) + count, count) + np.arange(count.sum())
+    low, high = (np.clip(np.repeat(ends, count) - at * height, 0, height) for ends in runs.T)
+    down = np.maximum(np.maximum(low - row[:, None], row[:, None] - high + 1), 0)
+    return np.sqrt(((at - column[:, None]) ** 2 + down**2).min(1).astype(np.float32))
 
 
 def with_doubts(

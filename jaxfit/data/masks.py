@@ -6,7 +6,7 @@ width and height, in image pixels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -27,25 +27,34 @@ def box_of_mask(mask: np.ndarray) -> tuple[int, int, int, int] | None:
     return x0, y0, int(columns[-1]) + 1 - x0, int(rows[-1]) + 1 - y0
 
 
-def decode_mask(rle: Mapping[str, Any], columns: tuple[int, int] | None = None) -> np.ndarray:
-    """Return the mask of run lengths: (H, W) bool.
-
-    Args:
-        rle: run lengths in the format of ``Observations.masks``, which are valid.
-        columns: the first column, and the column after the last, that are decoded; the others are background. A bird
-            covers a small part of a large image, and the time is that of the part. None decodes the whole mask.
-    """
+def decode_mask(rle: Mapping[str, Any]) -> np.ndarray:
+    """Return the mask of run lengths in the format of ``Observations.masks``, which are valid: (H, W) bool."""
     from pycocotools import mask as coco_mask
 
-    if columns is None:
-        return coco_mask.decode(cast(Any, rle)).view(bool)
-    height, width = rle["size"]
-    left, right = np.clip(columns, 0, width).tolist()
-    mask = np.zeros((width, height), bool)  # run lengths go column by column; untouched rows take no memory
-    pixels = mask.reshape(-1)
-    for start, end in np.clip(foreground_runs([rle]).pixels, left * height, right * height).tolist():
-        pixels[start:end] = True
-    return mask.T
+    return coco_mask.decode(cast(Any, rle)).view(bool)
+
+
+def decode_columns(
+    masks: Sequence[Mapping[str, Any]], columns: Sequence[tuple[int, int]]
+) -> Iterator[Bool[np.ndarray, "H W"]]:
+    """Yield masks of run lengths of which only some columns are decoded; the others are background.
+
+    A bird covers a small part of a large image, and the time is that of the part.
+
+    Args:
+        masks: as for `decode_mask`.
+        columns: the first column, and the column after the last, of each mask.
+    """
+    runs = foreground_runs(masks)
+    ends = np.searchsorted(runs.mask, np.arange(len(masks) + 1)).tolist()
+    for i, (rle, wanted) in enumerate(zip(masks, columns, strict=True)):
+        height, width = rle["size"]
+        left, right = (min(max(column, 0), width) * height for column in wanted)
+        mask = np.zeros((width, height), bool)  # run lengths go column by column; untouched rows take no memory
+        pixels = mask.reshape(-1)
+        for start, end in np.clip(runs.pixels[ends[i] : ends[i + 1]], left, right).tolist():
+            pixels[start:end] = True
+        yield mask.T
 
 
 def box_of_rle(rle: Mapping[str, Any]) -> tuple[int, int, int, int] | None:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfit.config.fit import FitConfig
-from jaxfit.data.masks import decode_mask
+from jaxfit.data.masks import decode_columns
 from jaxfit.data.observations import FROM_LABEL, FrameMasks, Observations
 from jaxfit.data.tracks import assumed_interval_s, frame_interval_s, frame_step
 from jaxfit.fitting.crops import crop_squares, cut_mask, mark_unknown
@@ -420,14 +420,16 @@ def _cut_masks(
     cuts: UInt8[np.ndarray, "T S S"],
 ) -> None:
     """Write the crops of the masks of one window in one view to `cuts`."""
-    for t in np.flatnonzero(has_mask).tolist():
-        columns = int(crop[t, 0]), int(crop[t, 0] + crop[t, 2])
-        full = decode_mask(cast(Any, masks.own[t]), columns)
-        cuts[t] = cut_mask(full, crop[t], cuts.shape[-1])
-        others = masks.others[t]
-        if others is not False:
-            others = None if others is None else decode_mask(others, columns)
-            mark_unknown(cuts[t], others, cast(Any, full.shape), crop[t])
+    rows = np.flatnonzero(has_mask).tolist()
+    own, others = {t: cast(Any, masks.own[t]) for t in rows}, {t: masks.others[t] for t in rows}
+    near = {t: mask for t, mask in others.items() if isinstance(mask, Mapping)}
+    columns = {t: (int(crop[t, 0]), int(crop[t, 0] + crop[t, 2])) for t in rows}
+    decoded = decode_columns([*own.values(), *near.values()], [columns[t] for t in (*own, *near)])
+    for t in rows:
+        cuts[t] = cut_mask(next(decoded), crop[t], cuts.shape[-1])
+    for t in rows:
+        if others[t] is not False:
+            mark_unknown(cuts[t], next(decoded) if t in near else None, own[t]["size"], crop[t])
 
 
 def _timeline(observations: Observations) -> Int[np.ndarray, "L"]:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 from support.evaluated import BIRD, N, T, solution, truth
 
 from jaxfit.data.flags import (
@@ -103,6 +104,33 @@ def test_keypoints_outside_the_mask():
     cells = np.argwhere(np.ones((N, T), bool))
     np.testing.assert_array_equal(contradict_masks(seen, cells), [[True, False, True, False], [False] * T])
     assert not contradict_masks(seen, cells[1:2]).any()
+
+
+def test_keypoints_outside_any_mask():
+    """SciPy's distances of all pixels; keypoints beyond the image, masks that touch its border, and an empty mask."""
+    rng, seen = np.random.default_rng(0), truth()
+    K, margin = len(seen.keypoint_names), 60
+    masks = np.zeros((N, T, 280, 320), bool)
+    for mask in masks.reshape(-1, 280, 320)[1:]:
+        low = rng.integers(0, 200, 2)
+        part = mask[low[0] : low[0] + rng.integers(1, 200), low[1] : low[1] + rng.integers(1, 200)]
+        part[:] = rng.random(part.shape) < rng.choice([0.001, 0.5, 1])
+    points = rng.uniform(-margin, [320 + margin, 280 + margin], (N, T, K, 2)).astype(np.float32)
+    sure, side = rng.random((N, T, K)) < 0.7, rng.uniform(20, 3000, (N, T)).astype(np.float32)
+    seen = dataclasses.replace(
+        seen,
+        keypoints_px=np.where(sure[..., None], points, 0),
+        confidence=sure.astype(np.float32),
+        box_px=np.stack([0 * side, 0 * side, side, side / 2], axis=-1),
+        masks={(n, t): encode_mask(masks[n, t]) for n in range(N) for t in range(T)},
+    )
+    expected = np.zeros((N, T), bool)
+    for n, t in np.argwhere(masks.any((2, 3))):
+        away = distance_transform_edt(~np.pad(masks[n, t], margin))
+        column, row = np.floor(points[n, t, sure[n, t]]).astype(int).T + margin
+        expected[n, t] = (away[row, column] > 0.1 * side[n, t]).mean() > 0.1
+    assert 0 < expected.sum() < masks.any((2, 3)).sum()
+    np.testing.assert_array_equal(contradict_masks(seen, np.argwhere(seen.present)), expected)
 
 
 def test_wide_error_bars_are_a_doubt():
