@@ -46,7 +46,6 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.data.result_folder import POSES
     from jaxfit.fitting.fit import fit, learn_weights
     from jaxfit.fitting.initial_poses import load_initial_poses
-    from jaxfit.fitting.ledge import ledge_config
     from jaxfit.foundation.files import check_replaceable
     from jaxfit.foundation.workers import open_cluster
     from jaxfit.perception.keypoints import with_outline_keypoints
@@ -56,6 +55,8 @@ def fit(options: argparse.Namespace) -> None:
     config, bird = load_config(options.config), find_bird(options.model)
     check_ledge_options(options, bird)
     if options.ledge is not None:
+        from jaxfit.fitting.ledge import ledge_config
+
         config = ledge_config(config)
     if options.cameras is not None:
         _fit_views(options, config, bird, start)

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int
-from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
 from jaxfit.data.masks import box_of_keypoints
@@ -102,8 +102,10 @@ def in_image(
     known = middle_of_crop if of_camera else s.crops.image_size_px[at] / 2
     centre = known if centre_px is None else np.asarray(centre_px)
     ray = np.concatenate([(pixel - centre) / focal, np.ones((len(root), 1))], axis=1)
-    turn = _between(root, ray)
-    orient = (turn * Rotation.from_rotvec(s.poses.global_orient[at].astype(np.float64))).as_rotvec()
+    turn = scipy.spatial.transform.Rotation.from_rotvec(_between(root, ray))
+    orient = (
+        turn * scipy.spatial.transform.Rotation.from_rotvec(s.poses.global_orient[at].astype(np.float64))
+    ).as_rotvec()
 
     def everywhere(values: np.ndarray) -> np.ndarray:
         filled = np.full((*s.valid.shape, *values.shape[1:]), np.nan)
@@ -139,12 +141,12 @@ def upward(axes: Float[np.ndarray, "M 3 3"]) -> Float[np.ndarray, "3"]:
     return up if up @ back > 0 else -up
 
 
-def _between(first: Float[np.ndarray, "M 3"], second: Float[np.ndarray, "M 3"]) -> Rotation:
-    """Return the smallest rotations that turn one direction into another."""
+def _between(first: Float[np.ndarray, "M 3"], second: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M 3"]:
+    """Return the smallest rotations that turn one direction into another, axis-angles in radians."""
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (first, second))
     axis = np.cross(a, b)
     sine, cosine = np.linalg.norm(axis, axis=1, keepdims=True), np.sum(a * b, axis=1, keepdims=True)
-    return Rotation.from_rotvec(axis / np.maximum(sine, 1e-12) * np.arctan2(sine, cosine))
+    return axis / np.maximum(sine, 1e-12) * np.arctan2(sine, cosine)
 
 
 def _continuous(axis_angle: Float[np.ndarray, "N T 3"], valid: np.ndarray) -> Float[np.ndarray, "N T 3"]:

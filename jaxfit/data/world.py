@@ -10,11 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
-from jaxfit.cameras.files import read_cameras
 from jaxfit.data.result_folder import CAMERAS
 from jaxfit.data.solution import Crops, Keypoints, Solution, World
 from jaxfit.foundation.errors import InputError
@@ -65,7 +64,7 @@ def in_world(
         orientation: axis-angle from the model to the camera, radians.
         root, keypoints: positions in the camera frame, model units.
     """
-    orient = Rotation.from_rotvec(np.nan_to_num(orientation).reshape(-1, 3)).as_matrix()
+    orient = scipy.spatial.transform.Rotation.from_rotvec(np.nan_to_num(orientation).reshape(-1, 3)).as_matrix()
     R = camera.R_cam_world.T @ orient.reshape(*orientation.shape, 3)
     return World(
         R_world_root=np.where(np.isnan(orientation)[..., None], np.nan, R).astype(np.float32),
@@ -114,7 +113,7 @@ def in_camera(solution: Solution, bird: Bird, camera: Camera) -> Solution:
         scale = s.poses.scale * extent / np.linalg.norm(before, axis=(-2, -1))
     pixels, valid = camera.project(points_m), s.valid & _sees(camera, points_m)
     turns = camera.R_cam_world @ np.where(valid[..., None, None], s.world.R_world_root, np.eye(3))
-    orient = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*valid.shape, 3)
+    orient = scipy.spatial.transform.Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*valid.shape, 3)
     return replace(
         s,
         valid=valid,
@@ -146,6 +145,8 @@ def as_filmed(folder: Path, solution: Solution, bird: Bird, name: str | None = N
     Raises:
         InputError: a name is given and the result is in no world, has no such camera, or the camera sees no bird.
     """
+    from jaxfit.cameras.files import read_cameras
+
     path = folder / CAMERAS
     if name is not None and solution.world is None:
         problem = f"is {name}, but the result is in no world that several cameras could see"

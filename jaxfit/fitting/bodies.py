@@ -58,9 +58,8 @@ from typing import NamedTuple, cast
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import block_diag
-from scipy.stats import chi2
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.solution import Solution
@@ -217,7 +216,7 @@ def estimate_bodies(
     postures = 3 * (bird.num_joints - 1) if offsets else 0
     # the numbers of a body, the offsets, and the posture that all birds have in common
     of_numbers = _symmetric(precision, bird) if "bone_length" in names else precision
-    prior = np.asarray(block_diag(of_numbers, np.eye(postures)))
+    prior = np.asarray(scipy.linalg.block_diag(of_numbers, np.eye(postures)))
     usable = [w for w, each in enumerate(evidence) if each is not None and np.isfinite(each.precision).all()]
 
     def of_data(own: Sequence[BodyEvidence], misfit: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -338,7 +337,7 @@ def _of_tracks(
         text = "birds of one species differ by %.0f %% of the variance of the prior in bones, and by %.0f %% in shape"
         _logger.info(text, *(100 * share for share in shares))
     _, mean, covariance = joint(shares, width)
-    whole = block_diag(unit, np.eye(len(prior) - len(unit)))
+    whole = scipy.linalg.block_diag(unit, np.eye(len(prior) - len(unit)))
     covariance = whole.T @ covariance @ whole
     return list(zip(mean @ whole, (covariance + covariance.swapaxes(1, 2)) / 2, strict=True))
 
@@ -356,7 +355,7 @@ def _agree(a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray], p
     values, vectors = np.linalg.eigh(root.T @ (S1 + S2 - both - both.T) @ root)
     known = values > MIN_VARIANCE
     squared = ((vectors.T @ root.T @ (m1 - m2))[known] ** 2 / values[known]).sum()
-    return bool(chi2.sf(squared, max(int(known.sum()), 1)) >= DIFFERENT)
+    return bool(scipy.special.chdtrc(max(int(known.sum()), 1), squared) >= DIFFERENT)
 
 
 def _prior(priors: Priors, config: FitConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -378,7 +377,11 @@ def _prior(priors: Priors, config: FitConfig) -> tuple[np.ndarray, np.ndarray, n
         weight = settings.get(term, {}).get("weight", 0.0)
         broad_blocks.append(broad_sd**-2 * np.eye(len(precision)))
         blocks.append(2 * weight * precision + broad_blocks[-1])
-    return np.concatenate(means), np.asarray(block_diag(*blocks)), np.asarray(block_diag(*broad_blocks))
+    return (
+        np.concatenate(means),
+        np.asarray(scipy.linalg.block_diag(*blocks)),
+        np.asarray(scipy.linalg.block_diag(*broad_blocks)),
+    )
 
 
 def _symmetric(precision: Float[np.ndarray, "P P"], bird: Bird) -> Float[np.ndarray, "P P"]:

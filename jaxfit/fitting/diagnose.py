@@ -47,18 +47,29 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
             frame_s=np.ones((), np.float32),
         )
         problem = Problem(stage_hyperparameters(config, stage, model.bird.keypoint_names), pose, targets)
+        ours = [name for name in stage.terms if program.terms[name].function.__module__.startswith("jaxfit.")]
+        for name in _unless_all_trace(program, [name for name in ours if name not in checked], pose, problem):
+            _trace(program.terms[name], _share_of(program, name), pose, problem)
+        checked.update(ours)
         for name in stage.terms:
             term = program.terms[name]
-            if term.function.__module__.startswith("jaxfit."):
-                if name not in checked:
-                    _trace(term, _share_of(program, name), pose, problem)
-                checked.add(name)
+            if name in ours:
                 continue
             _trace(term, jax.grad(_share_of(program, name)), pose, problem)
             if stage.solver == "levenberg_marquardt" or (config.error_bars and stage is config.stages[-1]):
                 _trace(term, _curvature_of(program, name), pose, problem)
                 if term.with_blocks is not None:
                     _trace(term, jax.grad(_share_of(program, name, with_blocks=True)), pose, problem)
+
+
+def _unless_all_trace(program: Program, names: list[str], pose: Pose, problem: Problem) -> list[str]:
+    """Return no name if terms can be traced, together, because one trace after the other takes longer; else all."""
+    try:
+        if names:
+            jax.eval_shape(_share_of(program, *names), pose, problem)
+    except Exception:  # a trace of each term alone then names the term
+        return names
+    return []
 
 
 def _trace(term: Term, function: Callable[..., object], *arguments: object) -> None:
@@ -129,14 +140,14 @@ def _not_finite(
     return jax.vmap(one)(problems, pose)
 
 
-def _share_of(program: Program, name: str, with_blocks: bool = False) -> Callable[[Pose, Problem], Array]:
-    """Return the weighted value of one term as a function of pose and problem.
+def _share_of(program: Program, *names: str, with_blocks: bool = False) -> Callable[[Pose, Problem], Array]:
+    """Return the weighted value of terms as a function of pose and problem.
 
     `with_blocks`: as Levenberg-Marquardt evaluates the term, together with its blocks.
     """
 
     def share(pose: Pose, problem: Problem) -> Array:
-        settings = {name: problem.hyperparameters.settings[name]}
+        settings = {name: problem.hyperparameters.settings[name] for name in names}
         arguments = problem_window(program, problem, pose), program.terms, settings
         return sum_with_blocks(*arguments)[0] if with_blocks else weighted_sum(*arguments)
 

@@ -26,8 +26,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.ndimage import gaussian_filter
 
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.posterior import Blocks, Columns, broad_precision, posterior_of, window_blocks, with_shared
@@ -264,9 +264,9 @@ def outline_error(
     """
     known = np.ones(mask.shape, bool)
     if unknown.any():
-        known = gaussian_filter(unknown.astype(np.float32), sigma, mode="constant") < 0.01
-    error = np.where(known, shown - gaussian_filter(mask.astype(np.float32), sigma, mode="constant"), 0)
-    wider = gaussian_filter(error, np.sqrt(3) * sigma, mode="constant")
+        known = scipy.ndimage.gaussian_filter(unknown.astype(np.float32), sigma, mode="constant") < 0.01
+    error = np.where(known, shown - scipy.ndimage.gaussian_filter(mask.astype(np.float32), sigma, mode="constant"), 0)
+    wider = scipy.ndimage.gaussian_filter(error, np.sqrt(3) * sigma, mode="constant")
     length = (np.hypot(*np.gradient(shown)) * known).sum()
     return float((error**2).sum()), float((wider**2).sum()), float(length)
 

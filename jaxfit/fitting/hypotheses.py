@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 from jaxfit.fitting.problem import Hyperparameters
 from jaxfit.model.kinematics import Pose
@@ -99,7 +99,7 @@ def compare_hypotheses(
     # the angle between each hypothesis and the best one of its row, in every frame
     orient = np.asarray(rows.pose.global_orient, np.float64)
     pairs = orient.reshape(-1, 3), np.repeat(orient[best], rows.count, axis=0).reshape(-1, 3)
-    rotation, of_best = (Rotation.from_rotvec(rotvecs) for rotvecs in pairs)
+    rotation, of_best = (scipy.spatial.transform.Rotation.from_rotvec(rotvecs) for rotvecs in pairs)
     angle_deg = np.rad2deg((rotation.inv() * of_best).magnitude()).reshape(orient.shape[:2])
     angle_deg = np.where(np.repeat(present, rows.count, axis=0), angle_deg, np.nan)
     is_other_pose = np.nanmedian(angle_deg, axis=1).reshape(total.shape) > MIN_ANGLE_DEG

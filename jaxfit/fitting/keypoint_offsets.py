@@ -25,8 +25,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.linalg import null_space
 
 from jaxfit.config.yaml_file import rounded
 from jaxfit.model.bird import Bird
@@ -87,7 +87,7 @@ def offset_directions(bird: Bird) -> Float[np.ndarray, "D K 3"]:
     zero, one = np.zeros_like(y), np.ones_like(y)
     moves = (zero, one, zero), (zero, zero, one), (zero, -z, y), (rest - rest.mean(0)).T  # turn about the lateral axis
     of_moves = [[(np.transpose(move) * direction).sum() for direction in free] for move in moves]
-    return np.tensordot(null_space(np.array(of_moves)).T, free, axes=1)
+    return np.tensordot(scipy.linalg.null_space(np.array(of_moves)).T, free, axes=1)
 
 
 def learn_offsets(

@@ -31,8 +31,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.linalg import cho_solve, get_lapack_funcs
 
 from jaxfit.config.fit import StageConfig
 from jaxfit.fitting.problem import Problem, Program, problem_window
@@ -109,7 +109,7 @@ def factorise(H: Blocks) -> Factors:
     """
     (_, T, L, _), C = H.band.shape, len(H.corner)
     band = np.concatenate([H.band, np.zeros((3, BANDWIDTH, L, L))], axis=1)  # frames after the last: 0
-    (invert_triangle,) = get_lapack_funcs(("trtri",), dtype=np.float64)
+    (invert_triangle,) = scipy.linalg.get_lapack_funcs(("trtri",), dtype=np.float64)
     inverses, gains = np.zeros((T, L, L)), np.zeros((2, T, L, L))
     # Block elimination. D_t, E_t, F_t are the blocks (t, t), (t, t + 1), (t, t + 2) after the elimination of the frames
     # before t. The elimination of frame t leaves its Schur complement in the frames that follow:
@@ -128,7 +128,7 @@ def factorise(H: Blocks) -> Factors:
     border = _solve_band(inverses, gains, H.border)
     schur = H.corner - np.einsum("tic,tid->cd", H.border, border)
     factor = np.linalg.cholesky((schur + schur.T) / 2)
-    corner = cho_solve((factor, True), np.eye(C)) if C else np.zeros((0, 0))
+    corner = scipy.linalg.cho_solve((factor, True), np.eye(C)) if C else np.zeros((0, 0))
     return Factors(inverses, gains, border, corner)
 
 

@@ -25,8 +25,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Int
-from scipy.spatial.transform import Rotation
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.fitting.hypotheses import LIKELIHOOD_RATIO, MIN_ANGLE_DEG
@@ -67,7 +67,10 @@ def seen_from_the_side(windows: Windows, config: FitConfig, model: FitModel) -> 
     fitted = fit_task(model, FitTask(configs, [frames, frames], [(r, i) for r in (0, 1) for i in range(len(w))]))
     runs = fitted[: len(w)], fitted[len(w) :]
     loss = np.array([[np.inf if each.failure else sum(each.loss.values()) for each in run] for run in runs])
-    above, around = (Rotation.from_rotvec([np.nan_to_num(each.pose.global_orient[0]) for each in run]) for run in runs)
+    above, around = (
+        scipy.spatial.transform.Rotation.from_rotvec([np.nan_to_num(each.pose.global_orient[0]) for each in run])
+        for run in runs
+    )
     differ = np.rad2deg((above.inv() * around).magnitude()) > MIN_ANGLE_DEG
     coordinates = 2 * (frames.confidence > 0).sum((1, 2))
     lower, higher = np.minimum(loss.min(0), np.finfo(float).max), loss.max(0)

@@ -5,14 +5,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfit.config.fit import FitConfig, InitialiseConfig, Parameter, StageConfig
@@ -33,6 +31,9 @@ from jaxfit.objective.registry import find_terms
 from jaxfit.raster.silhouette_reference import Blur
 from jaxfit.raster.zbuffer import vertex_normals
 
+if TYPE_CHECKING:
+    from optimistix import OptaxMinimiser
+
 
 class _AdamState(NamedTuple):
     minimiser: Any
@@ -43,12 +44,16 @@ class _AdamState(NamedTuple):
     """Number of rejected steps in this stage."""
 
 
-def _minimiser(hyperparameters: Hyperparameters) -> optx.OptaxMinimiser:
+def _minimiser(hyperparameters: Hyperparameters) -> OptaxMinimiser:
+    # imported here, because the import takes as long as two steps of Levenberg-Marquardt, which does not need them
+    import optax
+    from optimistix import OptaxMinimiser
+
     def scale(updates, _):
         return jax.tree.map(lambda update, step: -step * update, updates, hyperparameters.step_size)
 
     # with tolerances of 0 a stage takes all its steps, as in the paper
-    return optx.OptaxMinimiser(optax.chain(optax.scale_by_adam(), optax.stateless(scale)), rtol=0.0, atol=0.0)
+    return OptaxMinimiser(optax.chain(optax.scale_by_adam(), optax.stateless(scale)), rtol=0.0, atol=0.0)
 
 
 def _adam_init(program: Program, problem: Problem, carried: _AdamState | None) -> _AdamState:
