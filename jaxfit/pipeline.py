@@ -243,8 +243,6 @@ def reconstruct(
         given = None if masks is None else given_tracks(masks, video)
         config, networks = _choose(config, video, bird, segmenter, keypoints, progress, given is not None)
         if fit_of_others is not None and keypoint_name(config.track) == OUTLINE:
-            # the network of outlines knows the points of the model; a person may mean others
-            fit_of_others = fit_of_others if labelled is not None else replace(fit_of_others, learn_weights=())
             config = replace(config, fit=fit_of_others)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):

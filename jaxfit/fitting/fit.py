@@ -25,7 +25,7 @@ from jaxfit.fitting.collect import blend_seams, collect_windows
 from jaxfit.fitting.crops import square_images
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.initial_poses import InitialPoses
-from jaxfit.fitting.learn import Learnt, learn
+from jaxfit.fitting.learn import Learnt, learn, without_offsets_of_outlines
 from jaxfit.fitting.side_views import seen_from_the_side, single_frame_config
 from jaxfit.fitting.solve import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
 from jaxfit.fitting.stored_windows import StoredWindows
@@ -148,12 +148,15 @@ def learn_weights(
         InputError: as for `fit`.
     """
     observations = check_observations(observations, bird, source)
+    config, of_outlines = without_offsets_of_outlines(config, observations)
+    if not config.learn_weights:
+        return Learnt(config, {}, of_outlines)
     used = config if observations.masks else without_mask_stages(config)
     model = checked_model(observations, bird, [used], initial_poses, source)
     (windows,) = _windows_of_runs(observations, [used], model, source)
     values, remarks = learn(model, used, windows, progress, source)
     config = replace(config, learn_weights=())
-    return Learnt(with_values(config, values) if values else config, values, remarks)
+    return Learnt(with_values(config, values) if values else config, values, (*of_outlines, *remarks))
 
 
 def fit_runs(
@@ -188,6 +191,7 @@ def fit_runs(
             "config", "`learn_weights` names terms, but several fits at once learn no weights", LEARN_REMEDY
         )
     observations = check_observations(observations, bird, source)
+    configs = [without_offsets_of_outlines(config, observations)[0] for config in configs]
     skipped = report_distant_birds(observations, source)
     if not observations.masks:
         configs = _without_mask_stages(configs, source)

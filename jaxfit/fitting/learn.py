@@ -21,6 +21,8 @@ the errors would then lower the weight again.
 
 Offsets of the keypoints (`fitting/keypoint_offsets.py`) are learnt in the same rounds, before the scales.
 
+Offsets are not learnt from keypoints that the network `outline` made: these are the points of the model.
+
 Not learnt: the weight of `pose_prior` and the scales of the motion terms.
 
 Source: MacKay 1992, *Bayesian interpolation* (γ and the fixed point); Lange, Little and Taylor 1989, *Robust
@@ -43,6 +45,7 @@ from jaxtyping import Int
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import FitConfig, term_settings
 from jaxfit.config.yaml_file import config_to_yaml, rounded
+from jaxfit.data.observations import FROM_OUTLINE, Observations
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
 from jaxfit.fitting.bodies import stages_of_pass
 from jaxfit.fitting.evidence import KEYPOINTS, MASK, Evidence, measure
@@ -143,6 +146,18 @@ def learn(
     shown = ", ".join(f"{path} = {shown_value(value)}" for path, value in values.items())
     _logger.info("learnt: %s", shown or "nothing")
     return values, tuple(remarks)
+
+
+def without_offsets_of_outlines(config: FitConfig, observations: Observations) -> tuple[FitConfig, tuple[str, ...]]:
+    """Return the config without offsets to learn if the network `outline` made all keypoints, and the remark about it.
+
+    The network was trained on the points of the model, so that the offsets would be its errors.
+    """
+    made = np.asarray(observations.keypoint_origin)[observations.confidence.any(-1)]
+    if OFFSETS not in config.learn_weights or not made.size or (made != FROM_OUTLINE).any():
+        return config, ()
+    learnt = tuple(name for name in config.learn_weights if name != OFFSETS)
+    return replace(config, learn_weights=learnt), (f"no {OFFSETS} are learnt: outlines gave all keypoints",)
 
 
 def choose_windows(windows: Windows, most: int = MAX_WINDOWS) -> Int[np.ndarray, "S"]:

@@ -11,8 +11,10 @@ from support.birds import skin_by_hand
 from support.fits import BIRD, CAMERA, config, truths
 
 from jaxfit.config.fit import StageConfig, load_config
+from jaxfit.data.observations import FROM_LABEL, FROM_OUTLINE
 from jaxfit.fitting.fit import fit, learn_weights
 from jaxfit.fitting.keypoint_offsets import PRIOR_SHARE, first_offsets, learn_offsets
+from jaxfit.fitting.learn import without_offsets_of_outlines
 from jaxfit.fitting.solve import fit_model
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.camera import project
@@ -155,6 +157,21 @@ def test_the_fit_and_its_result_have_the_keypoints_of_the_config():
         return float(np.linalg.norm(solution.keypoints.px - observations.keypoints_px, axis=-1).mean())
 
     assert error_px(given) < 0.6 * error_px(PLAIN)
+
+
+def test_offsets_are_not_learnt_from_outlines():
+    """The network `outline` gives the points of the model; one label may be another point."""
+    seen, learning = observed(), dataclasses.replace(PLAIN, learn_weights=("keypoint_offsets", "keypoint_likelihood"))
+    origin = np.where(seen.present, FROM_OUTLINE, 0)
+    outlines = dataclasses.replace(seen, keypoint_origin=origin)
+    alone = dataclasses.replace(learning, learn_weights=("keypoint_offsets",))
+    learnt = learn_weights(outlines, BIRD, alone)
+    assert (learnt.values, learnt.config) == ({}, dataclasses.replace(PLAIN, learn_weights=()))
+    assert "# no keypoint_offsets are learnt: outlines gave all keypoints" in learnt.to_yaml()
+    assert without_offsets_of_outlines(learning, outlines)[0].learn_weights == ("keypoint_likelihood",)
+    origin[tuple(np.argwhere(seen.present)[0])] = FROM_LABEL
+    assert without_offsets_of_outlines(learning, dataclasses.replace(seen, keypoint_origin=origin)) == (learning, ())
+    assert without_offsets_of_outlines(learning, seen) == (learning, ())
 
 
 @pytest.mark.extended
