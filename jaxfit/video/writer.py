@@ -138,7 +138,7 @@ class VideoWriter:
             raise ValueError("the writer is not open: call write inside a `with` block")
         if self.size_px != self.written_size_px:
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="bgr24")
+        picture = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(frame), format="bgr24")
         picture = picture.reformat(
             format="yuv420p",
             dst_colorspace=Colorspace.ITU709,

@@ -14,6 +14,13 @@ from jaxfit.view.colours import INK, Colour
 SHIFT = 4  # OpenCV draws in units of 1/16 pixel; pixel centres are whole numbers in OpenCV, halves in jaxfit
 
 
+CIRCLE, FINE_CIRCLE = (
+    np.column_stack([f(np.linspace(0, 2 * np.pi, count, endpoint=False)) for f in (np.cos, np.sin)])
+    for count in (12, 72)
+)
+"""Points of a circle of radius 1."""
+
+
 def _fixed(points_px) -> Int[np.ndarray, "..."]:
     """Convert positions in image pixels to OpenCV's fixed-point numbers with `SHIFT`."""
     return np.clip(np.round((np.asarray(points_px, np.float64) - 0.5) * (1 << SHIFT)), -(2**19), 2**19).astype(np.int32)
@@ -35,11 +42,12 @@ def ring(
     width: int = 1,
     edge: Colour | None = INK,
 ) -> None:
-    """Draw a circle with an edge on both sides, so that it contrasts with any background; positions as for `dot`."""
-    for at in _fixed(points_px).reshape(-1, 2).tolist():
-        if edge is not None:
-            cv2.circle(image, at, round(radius * (1 << SHIFT)), edge, width + 1, cv2.LINE_AA, SHIFT)
-        cv2.circle(image, at, round(radius * (1 << SHIFT)), colour, width, cv2.LINE_AA, SHIFT)
+    """Draw circles with an edge on both sides, so that they contrast with any background; positions as for `dot`."""
+    centres = np.asarray(points_px, np.float64).reshape(-1, 1, 2)
+    curves = list(_fixed(centres + radius * (CIRCLE if radius < 10 else FINE_CIRCLE)))
+    if edge is not None:
+        cv2.polylines(image, curves, True, edge, width + 1, cv2.LINE_AA, SHIFT)
+    cv2.polylines(image, curves, True, colour, width, cv2.LINE_AA, SHIFT)
 
 
 def line(image: UInt8[np.ndarray, "H W 3"], a_px, b_px, colour: Colour, width: int = 1) -> None:
