@@ -48,7 +48,6 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.fitting.initial_poses import load_initial_poses
     from jaxfit.foundation.files import check_replaceable
     from jaxfit.foundation.workers import open_cluster
-    from jaxfit.perception.keypoints import with_outline_keypoints
 
     start = time.perf_counter()
     check_replaceable(options.out, options.overwrite, POSES)  # before the long work
@@ -68,6 +67,8 @@ def fit(options: argparse.Namespace) -> None:
         raise InputError(options.observations, "holds photographs, which show no common ledge", "leave out --ledge")
     config = _fewer_keypoints(config, names, options)
     if not config.min_keypoints:
+        from jaxfit.perception.keypoints import with_outline_keypoints
+
         observations = with_outline_keypoints(observations)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
     bodies = _known_bodies(options, config, bird, observations.track_id.tolist())

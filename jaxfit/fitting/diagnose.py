@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -11,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from jaxfit.config.fit import FitConfig
+from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.problem import Problem, Program, problem_window
 from jaxfit.fitting.solve import FitModel, needs_mask, stage_hyperparameters, stage_program, with_offsets
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.kinematics import Pose, rest_pose
 from jaxfit.objective.objective import evaluate_curvature, sum_with_blocks, weighted_sum
 from jaxfit.objective.posed_window import Targets
-from jaxfit.objective.registry import Term
+from jaxfit.objective.registry import Term, find_terms
 
 
 def check_terms(config: FitConfig, model: FitModel) -> None:
@@ -31,29 +32,24 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
         InputError: a term does not return a scalar, needs data that the model lacks, or raises. The error names the
             term.
     """
-    T, K = config.window, model.bird.num_keypoints
-    pose = with_offsets(model, rest_pose(model.bird, T, config.common_size))
-    checked: set[str] = set()
-    for stage in config.stages:
-        side = config.crop.size_px if needs_mask(stage) else 0
-        program = stage_program(config, stage, model)
-        targets = Targets(
-            keypoints_px=np.zeros((T, K, 2), np.float32),
-            confidence=np.zeros((T, K), np.float32),
-            mask=np.zeros((T, side, side), np.uint8),
-            has_mask=np.zeros(T, bool),
-            present=np.zeros(T, bool),
-            corner_px=np.zeros((T, 2), np.float32),
-            frame_s=np.ones((), np.float32),
-        )
-        problem = Problem(stage_hyperparameters(config, stage, model.bird.keypoint_names), pose, targets)
-        ours = [name for name in stage.terms if program.terms[name].function.__module__.startswith("jaxfit.")]
-        for name in _unless_all_trace(program, [name for name in ours if name not in checked], pose, problem):
-            _trace(program.terms[name], _share_of(program, name), pose, problem)
-        checked.update(ours)
+    pose = with_offsets(model, rest_pose(model.bird, config.window, config.common_size))
+    terms = {name: term for stage in config.stages for name, term in find_terms(stage.terms).items()}
+    ours = [name for name, term in terms.items() if term.function.__module__.startswith("jaxfit.")]
+    try:  # one trace of all is faster; where it fails, a trace of each term alone names the term
+        together = replace(config.stages[-1], terms=tuple(ours), override={})
+        program, problem = _example(config, together, model, pose)
+        jax.eval_shape(_share_of(program, *ours), pose, problem)
+        checked = set(ours)
+    except Exception:
+        checked = set()
+    for stage in config.stages if terms.keys() - checked else ():
+        program, problem = _example(config, stage, model, pose)
         for name in stage.terms:
             term = program.terms[name]
             if name in ours:
+                if name not in checked:
+                    _trace(term, _share_of(program, name), pose, problem)
+                checked.add(name)
                 continue
             _trace(term, jax.grad(_share_of(program, name)), pose, problem)
             if stage.solver == "levenberg_marquardt" or (config.error_bars and stage is config.stages[-1]):
@@ -62,14 +58,21 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
                     _trace(term, jax.grad(_share_of(program, name, with_blocks=True)), pose, problem)
 
 
-def _unless_all_trace(program: Program, names: list[str], pose: Pose, problem: Problem) -> list[str]:
-    """Return no name if terms can be traced, together, because one trace after the other takes longer; else all."""
-    try:
-        if names:
-            jax.eval_shape(_share_of(program, *names), pose, problem)
-    except Exception:  # a trace of each term alone then names the term
-        return names
-    return []
+def _example(config: FitConfig, stage: StageConfig, model: FitModel, pose: Pose) -> tuple[Program, Problem]:
+    """Return the program of a stage and a problem without a bird."""
+    T, K = config.window, model.bird.num_keypoints
+    side = config.crop.size_px if needs_mask(stage) else 0
+    targets = Targets(
+        keypoints_px=np.zeros((T, K, 2), np.float32),
+        confidence=np.zeros((T, K), np.float32),
+        mask=np.zeros((T, side, side), np.uint8),
+        has_mask=np.zeros(T, bool),
+        present=np.zeros(T, bool),
+        corner_px=np.zeros((T, 2), np.float32),
+        frame_s=np.ones((), np.float32),
+    )
+    hyperparameters = stage_hyperparameters(config, stage, model.bird.keypoint_names)
+    return stage_program(config, stage, model), Problem(hyperparameters, pose, targets)
 
 
 def _trace(term: Term, function: Callable[..., object], *arguments: object) -> None:

@@ -32,7 +32,7 @@ from itertools import permutations
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-import scipy.special
+import scipy
 from annotated_types import Gt
 from jaxtyping import Bool, Float, Int, Num, UInt8
 from pydantic import (
