@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -103,23 +104,22 @@ def _in_window(
     at = near[(near >= start) & (near <= start + 2 * half)]
     if len(at) < least or np.ptp(values[at]) < 2 * min_amplitude:
         return None
-    frequency = np.arange(LOWEST_HZ, highest, STEP / window_s)
-    measured = _sinusoid(time_s[at], values[at], frequency, time_s[hops], window_s)
+    measured = _sinusoid(time_s[at], values[at], highest, time_s[hops], window_s)
     return None if measured is None or measured[1] < min_amplitude else measured
 
 
 def _sinusoid(
-    time_s: np.ndarray, values: np.ndarray, frequency: np.ndarray, at_s: np.ndarray, window_s: float
+    time_s: np.ndarray, values: np.ndarray, highest: float, at_s: np.ndarray, window_s: float
 ) -> tuple[float, float, np.ndarray] | None:
     """Return frequency, amplitude and the phases at some times of the sinusoid that explains most; None if little."""
     middle = (time_s[0] + time_s[-1]) / 2
-    x = (time_s - middle) / window_s
-    weights = np.cos(np.pi * x / 1.1) ** 2 + 1e-6
+    time_s = np.round(time_s - middle, 9)  # most windows then have the same times
+    spectrum = _spectrum(time_s.tobytes(), highest, window_s)
+    x, weights, frequency = time_s / window_s, spectrum.weights, spectrum.frequency
     # without the line of weighted least squares
     flat, beside = (each - weights @ each / weights.sum() for each in (values, x))
     flat -= beside * (weights @ (beside * flat)) / (weights @ beside**2)
-    how = {"weights": weights, "floating_mean": True}
-    share = lombscargle(time_s - middle, flat, 2 * np.pi * frequency, normalize=True, **how)
+    share = spectrum.share(flat)
     best = int(np.argmax(share))
     # the number of independent values under the taper, and of independent frequencies
     count, tried = weights.sum() ** 2 / (weights**2).sum(), frequency[-1] * window_s
@@ -129,7 +129,41 @@ def _sinusoid(
         return None
     left, top, right = share[best - 1 : best + 2]
     peak = frequency[best] + (left - right) / (2 * (left - 2 * top + right)) * (frequency[1] - frequency[0])
-    fitted = lombscargle(time_s - middle, flat, np.array([2 * np.pi * peak]), normalize="amplitude", **how)
+    how = {"weights": weights, "floating_mean": True}
+    fitted = lombscargle(time_s, flat, np.array([2 * np.pi * peak]), normalize="amplitude", **how)
     wave = np.ravel(fitted)[0]
     phase = np.degrees(2 * np.pi * peak * (at_s - middle) - np.angle(wave)) % 360
     return float(peak), float(np.abs(wave)), phase
+
+
+class _Spectrum(NamedTuple):
+    """The generalised Lomb-Scargle periodogram of L times at F frequencies, except for the values.
+
+    SciPy would compute the sinusoids again for every window.
+    """
+
+    weights: Float[np.ndarray, "L"]
+    frequency: Float[np.ndarray, "F"]
+    waves: Float[np.ndarray, "F 2 L"]
+    """Cosine and sine without their weighted means, times the weights."""
+    inverse: Float[np.ndarray, "F 2 2"]
+    """Inverse of their weighted products."""
+
+    def share(self, values: Float[np.ndarray, "L"]) -> Float[np.ndarray, "F"]:
+        """Return the share of the variance of values of mean 0 that the sinusoid of each frequency explains."""
+        product = self.waves @ values
+        explained = np.einsum("fi,fij,fj->f", product, self.inverse, product)
+        return explained / (self.weights @ values**2)
+
+
+@lru_cache(64)
+def _spectrum(times: bytes, highest: float, window_s: float) -> _Spectrum:
+    """Return the spectrum of times (float64, seconds from the middle of the window) up to a frequency."""
+    time_s = np.frombuffer(times)
+    weights = np.cos(np.pi * time_s / window_s / 1.1) ** 2 + 1e-6
+    frequency = np.arange(LOWEST_HZ, highest, STEP / window_s)
+    angle = 2 * np.pi * frequency[:, None] * time_s
+    waves = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    waves -= waves @ weights[:, None] / weights.sum()
+    weighted = waves * weights
+    return _Spectrum(weights, frequency, weighted, np.linalg.inv(weighted @ waves.swapaxes(1, 2)))
