@@ -94,6 +94,9 @@ def _in_window(
         return None
     half = int(whole_frames(window_s / 2, np.array(interval_s)))
     near = np.arange(max(t - 2 * half, 0), min(t + 2 * half + 1, len(time_s)))
+    around = values[near]
+    if not np.fmax.reduce(around) - np.fmin.reduce(around) >= 2 * min_amplitude:  # most windows, so at once
+        return None
     near = near[np.isfinite(values[near]) & (np.abs(time_s[near] - time_s[hops.start]) <= window_s)]
     # two thirds of the frames of a window, so that a gap is no rhythm
     least = 2 * (2 * half + 1) // 3
