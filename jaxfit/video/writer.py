@@ -46,6 +46,8 @@ class VideoWriter:
         codec: a name in ``CODECS``, or ``auto`` for the first codec of the container (``CONTAINERS``). If this
             installation lacks the codec, the next codec of the container is used with a warning, and ``fallback`` is
             True.
+        b_frames: whether frames may depend on later frames. Without these, a film is a tenth larger and is encoded in
+            three quarters of the time.
 
     Raises:
         ValueError: the codec is unknown, or the size or rate is invalid.
@@ -58,7 +60,14 @@ class VideoWriter:
     fallback: bool
     """Whether the codec differs from the requested codec (for ``auto``, from the first codec of the container)."""
 
-    def __init__(self, path: str | Path, size_px: tuple[int, int], fps: float | Fraction, codec: str = "auto"):
+    def __init__(
+        self,
+        path: str | Path,
+        size_px: tuple[int, int],
+        fps: float | Fraction,
+        codec: str = "auto",
+        b_frames: bool = True,
+    ):
         self.path = Path(path)
         if codec != "auto" and codec not in CODECS:
             raise ValueError(f"codec must be auto or one of {', '.join(CODECS)}, not {codec!r}")
@@ -85,6 +94,7 @@ class VideoWriter:
             problem = f"PyAV has no encoder for {', '.join(suited)}"
             raise InputError(self.path, problem, "install another build of PyAV")
         self.codec, self.fallback = chosen, chosen != requested
+        self._options = {} if b_frames else {"bf": "0"}
         if self.fallback:
             note = "" if chosen != "mpeg4" else "; players play it, browsers do not"
             _logger.warning("%s: PyAV has no %s encoder, written as %s%s", self.path.name, requested, chosen, note)
@@ -99,7 +109,7 @@ class VideoWriter:
         kind = self.path.suffix[1:].lower()
         with new_file(self.path) as part, av.open(str(part), "w", format=kind, container_options=options) as container:
             encoder, settings = CODECS[self.codec]
-            stream: Any = container.add_stream(encoder, rate=self.fps, options=settings)
+            stream: Any = container.add_stream(encoder, rate=self.fps, options=settings | self._options)
             stream.width, stream.height = self.written_size_px
             stream.pix_fmt = "yuv420p"
             context = stream.codec_context

@@ -231,7 +231,7 @@ def overlay(
         return frame.number, drawing.draw(frame)
 
     with (
-        VideoWriter(out, drawing.size_px, max(fps, SLOWEST_FPS), codec) as writer,
+        VideoWriter(out, drawing.size_px, max(fps, SLOWEST_FPS), codec, b_frames=False) as writer,
         progress("overlay", (last - first) // step + 1) as report_progress,
         closing(in_threads(drawn, frames(), usable_cores())) as images,
     ):

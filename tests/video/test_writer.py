@@ -4,8 +4,10 @@ import logging
 import re
 
 import av
+import cv2
 import numpy as np
 import pytest
+from av.video.frame import PictureType
 from support.films import COUNT, FPS, SIZE, frames, write
 
 from jaxfit.foundation.errors import InputError
@@ -47,6 +49,17 @@ def test_the_same_bytes_every_time(tmp_path, name, codec):
         write(tmp_path / name, codec, size=(320, 240), count=12)
         contents.add((tmp_path / name).read_bytes())
     assert len(contents) == 1
+
+
+@pytest.mark.parametrize(("name", "codec"), [("a.mp4", "auto"), ("a.mp4", "vp9"), ("a.mp4", "mpeg4")])
+def test_films_without_frames_that_depend_on_later_ones(tmp_path, name, codec):
+    rng = np.random.default_rng(0)
+    picture = cv2.resize(rng.integers(0, 256, (20, 30, 3), np.uint8), (320, 240))
+    with VideoWriter(tmp_path / name, (320, 240), FPS, codec, b_frames=False) as writer:
+        for i in range(12):
+            writer.write(np.roll(picture, 3 * i, axis=1))
+    with av.open(str(tmp_path / name)) as container:
+        assert PictureType.B not in {frame.pict_type for frame in container.decode(video=0)}
 
 
 def test_a_keyframe_every_second_and_the_index_first(tmp_path):
