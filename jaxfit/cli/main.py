@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import logging
 import os
@@ -22,6 +23,7 @@ STOPPED = 130
 
 def run() -> NoReturn:
     """Run `main` on the arguments of the terminal and end the process: the installed command."""
+    gc.disable()  # until the modules are loaded, which live on: collections would visit them again and again
     _prepare_streams(verbose=bool({"-v", "--verbose"} & set(sys.argv)))
     # NumPy's products here are small: with several threads, most of their time is spent waiting for each other
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -74,7 +76,11 @@ def main(arguments: list[str] | None = None) -> int:
         if command != "doctor":  # which reports the variable
             _check_isa()
         # imported here, so that help and wrong arguments do not wait for the imports of commands
-        getattr(import_module(f"jaxfit.cli.{module}"), command)(options)
+        run_command = getattr(import_module(f"jaxfit.cli.{module}"), command)
+        if not gc.isenabled():
+            gc.freeze()
+            gc.enable()
+        run_command(options)
     except InputError as error:
         return _rejected(error)
     except KeyboardInterrupt:
