@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxfit.fitting.problem import Problem, Program, Solver, problem_window, with_fixed
 from jaxfit.model.kinematics import Pose
-from jaxfit.objective.curvature import FrameBlocks, Rows, add_rows, frame_rows, shared_columns
+from jaxfit.objective.curvature import FrameBlocks, Rows, add_rows, frame_rows, pentadiagonal_solver, shared_columns
 from jaxfit.objective.objective import evaluate_curvature, sum_with_blocks
 
-CG_STEPS, CG_TOLERANCE = 100, 0.01
+CG_STEPS, CG_TOLERANCE = 30, 0.01
 """Largest number of conjugate-gradient steps within one step, and the relative residual at which they end. The
 first steps need few of them. A tolerance far below 1e-6 makes single precision underflow to 0/0."""
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-2, 1e-5, 1e8
@@ -93,12 +93,14 @@ def _levenberg_step(
     diagonal = allowed(curvature.diagonal)
     # a parameter without curvature has no gradient and does not change
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
-    # (H + μ·diag H)·d = −g without the matrix; the diagonal as preconditioner makes angles, lengths and scales
-    # comparable
+    # (H + μ·diag H)·d = −g without the matrix. The preconditioner couples the frames of each parameter, because the
+    # terms of motion hold most of H where a bird is at rest.
+    bands = jnp.where(optimised & ~is_shared, curvature.bands, 0.0)
+    precondition = pentadiagonal_solver((1 + state.damping) * diagonal, bands)
     newton, _ = cg(
         lambda d: allowed(curvature.product(d)) + state.damping * diagonal * d,
         -gradient,
-        M=lambda d: d / diagonal,
+        M=precondition,
         tol=CG_TOLERANCE,
         maxiter=CG_STEPS,
     )

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfit.model.kinematics import Pose
 
+SMALLEST_PIVOT = 1e-5
+"""Of the diagonal; far above the rounding of float32 (6e-8), far below the pivots of real windows."""
 SHARED_PARAMETERS = ("bone_length", "betas")
 """The parameters that all frames of a window share, beside a common scale."""
 
@@ -33,6 +36,9 @@ FrameBlocks = Float[Array, "T D D"]
 `frame_rows`."""
 
 
+NO_BANDS = np.zeros((2, 1, 1), np.float32)
+
+
 class Curvature(NamedTuple):
     """A positive semi-definite H on rows of frames."""
 
@@ -41,6 +47,9 @@ class Curvature(NamedTuple):
     these parameters."""
     diagonal: Rows
     """Diagonal of H. For a shared parameter, only the mean over the rows counts."""
+    bands: Float[Array, "2 T D"] | Float[np.ndarray, "2 1 1"] = NO_BANDS
+    """Entries of H between a parameter of a frame and the same parameter one frame later and two frames later; 0 for
+    the last frames. Only the solver's preconditioner uses them, so they may be left out."""
 
 
 def block_curvature(blocks: FrameBlocks) -> Curvature:
@@ -54,8 +63,47 @@ def sum_of_curvatures(curvatures: Sequence[Curvature]) -> Curvature:
     def product(d: Rows) -> Rows:
         return sum((H.product(d) for H in curvatures), start=jnp.zeros_like(d))
 
-    # curvatures add: H = Σ λ·H_term, and so do products and diagonals
-    return Curvature(product, sum((H.diagonal for H in curvatures), start=jnp.zeros(())))
+    # curvatures add: H = Σ λ·H_term, and so do products, diagonals and bands
+    diagonal = sum((H.diagonal for H in curvatures), start=jnp.zeros(()))
+    return Curvature(product, diagonal, sum((H.bands for H in curvatures), start=NO_BANDS))
+
+
+def pentadiagonal_solver(diagonal: Rows, bands: Float[Array, "2 T D"]) -> Callable[[Rows], Rows]:
+    """Return v ↦ P⁻¹·v for the part P of H between equal parameters of frames at most two apart.
+
+    P is a pentadiagonal matrix for every parameter, factored as L·D·Lᵀ. Where rounding makes a pivot vanish, the pivot
+    is a small share of the diagonal, so that P is always positive definite.
+
+    Args:
+        diagonal: diagonal of P, positive.
+        bands: entries of P one and two frames apart, as `Curvature.bands`.
+    """
+    first, second = (jnp.concatenate([jnp.zeros_like(b[:k]), b[:-k]]) for k, b in ((1, bands[0]), (2, bands[1])))
+    one = jnp.ones_like(diagonal[0])
+
+    def factor(before: Any, row: Any) -> Any:
+        pivot_1, pivot_2, lower_1 = before  # of the frame before, of two frames before
+        a, b, c = row
+        second = c / pivot_2
+        first = (b - second * pivot_2 * lower_1) / pivot_1
+        pivot = jnp.maximum(a - first**2 * pivot_1 - second**2 * pivot_2, SMALLEST_PIVOT * a)
+        return (pivot, pivot_1, first), (pivot, first, second)
+
+    _, (pivots, lower_1, lower_2) = jax.lax.scan(factor, (one, one, 0 * one), (diagonal, first, second))
+
+    def substitute(before: Any, row: Any) -> Any:
+        (x_1, x_2), (v, b, c) = before, row
+        x = v - b * x_1 - c * x_2
+        return (x, x_1), x
+
+    upper_1, upper_2 = (jnp.concatenate([b[k:], jnp.zeros_like(b[:k])]) for k, b in ((1, lower_1), (2, lower_2)))
+
+    def solve(rows: Rows) -> Rows:
+        start = jnp.zeros_like(rows[0]), jnp.zeros_like(rows[0])
+        _, y = jax.lax.scan(substitute, start, (rows, lower_1, lower_2))
+        return jax.lax.scan(substitute, start, (y / pivots, upper_1, upper_2), reverse=True)[1]
+
+    return solve
 
 
 def frame_rows(pose: Pose, shared: Sequence[str] = ()) -> Rows:

@@ -69,7 +69,7 @@ def place_likelihood(window: PosedWindow, *, sd_px_s2: Scalar | float = 300.0, d
     complete = jnp.asarray(complete_runs(window.present, 2), jnp.float32)
     acceleration_px = window.place_acceleration_px
     kernel = student_t(dof, acceleration_px.shape[-1])
-    return Residuals(acceleration_px / (sd_px_s2 * window.frame_s**2), complete, kernel)
+    return Residuals(acceleration_px / (sd_px_s2 * window.frame_s**2), complete, kernel, chain=True)
 
 
 @term(positive=["sd_rad_s2", "dof"])
@@ -95,4 +95,4 @@ def motion_likelihood(
 
     kernel = student_t(dof, 3)
     orient, joints = accelerations(window.pose.global_orient), accelerations(window.pose.body_pose)
-    return Residuals(orient, complete, kernel), Residuals(joints, complete[:, None], kernel)
+    return Residuals(orient, complete, kernel, chain=True), Residuals(joints, complete[:, None], kernel, chain=True)

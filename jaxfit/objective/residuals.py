@@ -86,6 +86,9 @@ class Residuals(NamedTuple):
     """Optional: returns the derivatives of the R residuals of each frame with respect to the row of the frame
     (`frame_rows`), in blocks of columns. Only for speed, where a formula is faster than automatic differentiation. The
     first axis of `values` is then that of the frames, and no residual depends on other frames."""
+    chain: bool = False
+    """Whether every residual depends on at most three consecutive frames, and in each on one joint alone, or on the
+    translation alone. Only for speed: the solver then knows how consecutive frames are coupled."""
 
 
 def residual_sum(residuals: Residuals | Sequence[Residuals]) -> Scalar:
@@ -106,8 +109,8 @@ def residual_curvature(
     s = ‖r‖². For Student's t, the mean of this H over the density is the Fisher information. The bound is larger by
     the factor (ν + n + 2)/(ν + n), so standard deviations from the bound would be too small.
 
-    If the residuals have no `jacobian`, the product with H is exact and its diagonal is an estimate: the mean of
-    (Jᵀ·√(2w·ρ′)·u)² over `PROBES` vectors u of random signs, which are always the same.
+    If the residuals have neither `jacobian` nor `chain`, the product with H is exact and its diagonal is an estimate:
+    the mean of (Jᵀ·√(2w·ρ′)·u)² over `PROBES` vectors u of random signs, which are always the same.
 
     Args:
         window: one bird in one window.
@@ -125,22 +128,17 @@ def residual_curvature(
         factor = jax.lax.stop_gradient(2 * each.weight * slope)
         return jnp.broadcast_to(factor[..., None], each.values.shape)
 
-    curvatures, by_jax, factors = [], [], []
-    for function in terms:
-        parts = as_list(function(window))
-        curvatures += [_from_jacobian(part, factor_of(part)) for part in parts if part.jacobian is not None]
-        others = [i for i, part in enumerate(parts) if part.jacobian is None]
-        if others:
-            by_jax.append((function, others))
-            factors += [factor_of(parts[i]) for i in others]
-    if by_jax:
+    parts = [(function, i, part) for function in terms for i, part in enumerate(as_list(function(window)))]
+    curvatures = [_from_jacobian(part, factor_of(part)) for *_, part in parts if part.jacobian is not None]
+    for chain in (False, True):
+        own = [(function, i, part) for function, i, part in parts if part.jacobian is None and part.chain == chain]
 
-        def values_at(d: Rows) -> list[Float[Array, "..."]]:
+        def values_at(d: Rows, own: Any = own) -> list[Float[Array, "..."]]:
             moved = window.moved(d)
-            parts = [(as_list(function(moved)), others) for function, others in by_jax]
-            return [jnp.asarray(own[i].values) for own, others in parts for i in others]
+            return [jnp.asarray(as_list(function(moved))[i].values) for function, i, _ in own]
 
-        curvatures.append(_from_jax(window, values_at, factors))
+        if own:
+            curvatures.append(_from_jax(window, values_at, [factor_of(part) for *_, part in own], chain))
     return sum_of_curvatures(curvatures)
 
 
@@ -161,7 +159,9 @@ def _from_jacobian(residuals: Residuals, factor: Float[Array, "..."]) -> Curvatu
     return Curvature(product, jnp.concatenate(diagonal, axis=1))
 
 
-def _from_jax(window: PosedWindow, values_at: Callable[[Rows], list], factors: list[Float[Array, "..."]]) -> Curvature:
+def _from_jax(
+    window: PosedWindow, values_at: Callable[[Rows], list], factors: list[Float[Array, "..."]], chain: bool
+) -> Curvature:
     """Return the curvature of residuals, as functions of a change of the pose."""
     zero = jnp.zeros_like(frame_rows(window.pose, window.shared))
     _, forward = jax.linearize(values_at, zero)
@@ -169,6 +169,9 @@ def _from_jax(window: PosedWindow, values_at: Callable[[Rows], list], factors: l
 
     def product(d: Rows) -> Rows:
         return backward([factor * change for factor, change in zip(factors, forward(d), strict=True)])[0]
+
+    if chain:
+        return Curvature(product, *_bands(product, *zero.shape))
 
     # E[(Jᵀ·√D·u)ᵢ²] = Σ_r J_ri²·D_r = H_ii, because random signs of different residuals have the mean product 0
     def probe(signs: Sequence[Int8[Array | np.ndarray, "..."]]) -> Rows:
@@ -180,6 +183,22 @@ def _from_jax(window: PosedWindow, values_at: Callable[[Rows], list], factors: l
     # the gradient of a shared parameter is divided between the rows, so its square is too small
     rows = jnp.where(shared_columns(window.pose, window.shared), len(zero), 1)
     return Curvature(product, rows * diagonal)
+
+
+def _bands(product: Callable[[Rows], Rows], frames: int, columns: int) -> tuple[Rows, Float[Array, "2 T D"]]:
+    """Return the diagonal and the `Curvature.bands` of residuals that are a `chain`, from 15 products.
+
+    Each product is with ones in one of the three components of every joint, in every fifth frame. H couples these
+    neither with each other nor with the same frame or joint, so the products hold single entries of H.
+    """
+    which = np.arange(5)[:, None, None, None], np.arange(3)[:, None, None]
+    combs = (np.arange(frames)[:, None] % 5 == which[0]) & (np.arange(columns) % 3 == which[1])
+    products = jax.vmap(product)(jnp.asarray(combs.reshape(15, frames, columns), jnp.float32))
+    products = jnp.pad(products.reshape(5, 3, frames, columns), [(0, 0), (0, 0), (0, 2), (0, 0)])
+    frame, column = np.arange(frames)[:, None], np.arange(columns)
+    # `frame_rows` has the three components of every joint, and of the translation, beside each other
+    diagonal, *bands = (products[frame % 5, column % 3, frame + ahead, column] for ahead in range(3))
+    return diagonal, jnp.stack(bands)
 
 
 def as_list(residuals: Residuals | Sequence[Residuals]) -> list[Residuals]:

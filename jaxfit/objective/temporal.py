@@ -50,7 +50,8 @@ def _differences(
     complete = jnp.asarray(complete_runs(window.present, order), jnp.float32)
     orient = jnp.diff(window.pose.global_orient, order, axis=0)
     body = jnp.diff(window.pose.body_pose.reshape(frames, -1), order, axis=0)
-    return Residuals(orient, beta_global * complete, NORM), Residuals(body, beta_pose * complete, NORM)
+    parts = (orient, beta_global * complete), (body, beta_pose * complete)
+    return tuple(Residuals(*part, NORM, chain=True) for part in parts)
 
 
 def complete_runs(present: Bool[Array | np.ndarray, "T"], order: int) -> Bool[Array | np.ndarray, "runs"]:
@@ -83,7 +84,8 @@ def geodesic_velocity(
     # the norm of the concatenated rotation vectors is √(Σ_j d_j²): all joints are one group
     orient, joints, complete = _rotations_between_frames(window)
     joints = joints.reshape(len(joints), 3 * joints.shape[1])
-    return Residuals(orient, beta_global * complete, NORM), Residuals(joints, beta_pose * complete, NORM)
+    parts = (orient, beta_global * complete), (joints, beta_pose * complete)
+    return tuple(Residuals(*part, NORM, chain=True) for part in parts)
 
 
 @term(positive=["delta_rad"])
@@ -105,8 +107,8 @@ def huber_velocity(
     """
     orient, joints, complete = _rotations_between_frames(window)
     kernel = huber(delta_rad)
-    orient_part = Residuals(orient, beta_global * complete, kernel)
-    return orient_part, Residuals(joints, beta_pose * complete[:, None], kernel)
+    parts = (orient, beta_global * complete), (joints, beta_pose * complete[:, None])
+    return tuple(Residuals(*part, kernel, chain=True) for part in parts)
 
 
 def _rotations_between_frames(

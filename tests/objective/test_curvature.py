@@ -10,7 +10,7 @@ from support import terms_by_hand
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.rotation import axis_angle_to_matrix, right_jacobian
-from jaxfit.objective.curvature import SHARED_PARAMETERS, add_rows, frame_rows, shared_columns
+from jaxfit.objective.curvature import SHARED_PARAMETERS, add_rows, frame_rows, pentadiagonal_solver, shared_columns
 from jaxfit.objective.objective import evaluate_curvature, residual_sum
 from jaxfit.objective.registry import Term, find_term, find_terms
 from jaxfit.objective.residuals import NORM, as_list, geman_mcclure, huber, student_t
@@ -19,6 +19,7 @@ T = terms_by_hand.T
 TERMS = terms_by_hand.TERMS
 MASKS = ["mask", "mask_smooth_l1"]
 KEYPOINTS = ["keypoints", "keypoint_likelihood"]
+CHAINS = ["velocity", "acceleration", "geodesic_velocity", "huber_velocity", "motion_likelihood", "place_likelihood"]
 RESIDUALS = [name for name in TERMS if name not in MASKS]
 LINEAR = [
     "pose_prior",
@@ -63,13 +64,13 @@ def basis():
 
 @jax.jit
 def curvatures(pose, targets):
-    """For each term: the matrix H over the changes of `basis`, and the diagonal that the curvature returns."""
+    """For each term: H over the changes of `basis`, and the diagonal and the bands of the curvature."""
     window, results = window_of(pose, targets), {}
     for name in TERMS:
         H = evaluate_curvature(window, find_terms([name]), settings(name))
         product = jax.vmap(H.product)(basis())
         diagonal = jnp.concatenate([H.diagonal[:, ~IS_SHARED].ravel(), H.diagonal[:, IS_SHARED].sum(axis=0)])
-        results[name] = jnp.einsum("itd,jtd->ij", basis(), product), diagonal
+        results[name] = jnp.einsum("itd,jtd->ij", basis(), product), diagonal, H.bands
     return results
 
 
@@ -166,18 +167,46 @@ def test_curvature_is_the_weighted_square_of_the_jacobian():
 
 def test_product_and_diagonal_belong_to_one_positive_semidefinite_matrix():
     for name, each in curvatures(*case()).items():
-        H, diagonal = (np.asarray(x, np.float64) for x in each)
+        H, diagonal, bands = (np.asarray(x, np.float64) for x in each)
         scale = np.abs(H).max()
         np.testing.assert_allclose(H, H.T, atol=1e-5 * scale, err_msg=name)
         assert np.linalg.eigvalsh(H).min() > -1e-4 * scale, name
         used = np.diagonal(H) > 1e-6 * scale
         assert (diagonal[used] > 0).all(), name
-        if name in [*MASKS, *KEYPOINTS]:
+        if name in CHAINS:
+            framewise = int((~IS_SHARED).sum())
+            for ahead in (1, 2):
+                expected = np.diagonal(H, ahead * framewise)[: (T - ahead) * framewise].reshape(-1, framewise)
+                np.testing.assert_allclose(bands[ahead - 1][:-ahead, ~IS_SHARED], expected, atol=1e-5 * scale)
+                assert not bands[ahead - 1][-ahead:].any(), name
+                assert expected.any() or "velocity" in name, name
+        else:
+            assert not bands.any(), name
+        if name in [*MASKS, *KEYPOINTS, *CHAINS]:
             np.testing.assert_allclose(diagonal, np.diagonal(H), atol=1e-5 * scale, err_msg=name)
         else:  # an estimate from random signs, with a relative standard deviation of at most √(2/16)
             ratio = diagonal[used] / np.diagonal(H)[used]
             assert 0.7 < ratio.mean() < 1.3, name
             assert ratio.max() < 4, name
+
+
+def test_the_pentadiagonal_part_is_inverted():
+    """Also where it has no inverse, as for a term of acceleration alone: the result is then finite."""
+    rng = np.random.default_rng(0)
+    differences = np.diff(np.eye(9), 2, axis=0)
+    weights = 10.0 ** rng.uniform(-1, 3, (4, 7))  # of birds that rest and move
+    P = np.einsum("kti,dk,ktj->dij", differences[:, None], weights, differences[:, None]) + 0.3 * np.eye(9)
+    rows = rng.normal(size=(9, 4)).astype(np.float32)
+    expected = np.linalg.solve(P, rows.T[..., None])[..., 0].T
+
+    @jax.jit
+    def solved(P):
+        diagonals = (jnp.pad(jnp.diagonal(P, ahead, 1, 2), [(0, 0), (0, ahead)]).T for ahead in range(3))
+        diagonal, *bands = diagonals
+        return pentadiagonal_solver(diagonal, jnp.stack(bands))(jnp.asarray(rows))
+
+    np.testing.assert_allclose(solved(jnp.asarray(P, jnp.float32)), expected, rtol=2e-3, atol=1e-3)
+    assert np.isfinite(solved(jnp.asarray(P - 0.3 * np.eye(9), jnp.float32))).all()
 
 
 def case():
@@ -241,7 +270,7 @@ def test_missing_frames_have_no_curvature():
         for name, each in curvatures(terms_by_hand.window_pose(), targets).items():
             if name == "low_pass":  # the term fills missing frames
                 continue
-            H, diagonal = map(np.asarray, each)
+            H, diagonal, _ = map(np.asarray, each)
             assert not np.any(H[own]), (name, missing)
             assert not np.any(H[:, own]), (name, missing)
             assert not np.any(diagonal[own]), (name, missing)
@@ -251,7 +280,8 @@ def test_equal_frames_have_finite_curvature():
     pose = terms_by_hand.window_pose()
     equal = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x)[:1], x.shape), pose)
     equal = dataclasses.replace(equal, bone_length=pose.bone_length, betas=0 * np.asarray(pose.betas))
-    for name, (H, diagonal) in curvatures(equal, terms_by_hand.random_targets()).items():
+    for name, (H, diagonal, bands) in curvatures(equal, terms_by_hand.random_targets()).items():
         assert np.isfinite(H).all(), name
         assert np.isfinite(diagonal).all(), name
+        assert np.isfinite(bands).all(), name
         assert np.abs(H).max() > 0 or name == "joint_limits", name
