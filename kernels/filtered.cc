@@ -17,6 +17,7 @@ namespace jaxfit {
 namespace {
 
 constexpr float kCovered = 0.9999f;  // from this mean of N on, a pixel is covered
+constexpr float kRounding = 1e-5f;  // sums of N round by less, so a smaller error is none
 constexpr int64_t kRowsPerColumn = 16;  // the Gauss-Newton block has at most this many rows per column of the image
 
 // Taps of a Gaussian with the variance of the soft rasteriser's edge, whose profile is sigmoid(-x·|x| / s): 2·ln(2)·s.
@@ -37,13 +38,16 @@ struct Filter {
   }
 };
 
-// Images are planes with rows of `stride` floats: a margin of `radius` zeros, the pixels, and zeros up to the end.
+// Images are planes with rows of `stride` floats: a margin of `radius` zeros, the pixels, and zeros up to the end. The
+// blocks are those of kLanes pixels of a line.
 struct Workspace {
   float* taps;
-  float *front, *back;  // means of N of the two sides; later the factors of their edges in the gradient
+  float *front, *back;  // means of N of the two sides
   float *error, *other;
+  uint8_t *marked, *reached;  // (size, blocks): where `error` and `other` are not 0
+  int32_t* count;             // (blocks): marks in the lines within the radius
   int16_t *front_edges, *back_edges;  // for each edge how often it remains, with the sign of its direction
-  int64_t radius, stride, plane, size;
+  int64_t radius, stride, plane, size, blocks;
   bool closed;  // the edges of both sides are the same, and so are the means
 };
 
@@ -51,16 +55,20 @@ struct Workspace {
   const Filter filter(blur);
   Workspace ws;
   ws.size = size, ws.radius = filter.radius;
+  ws.blocks = round_up(size) / kLanes;
   ws.stride = round_up(size) + round_up(2 * ws.radius);
   ws.plane = ws.stride * (size + 1);
   float* p = static_cast<float*>(memory);
   ws.taps = p, p += round_up(2 * ws.radius + 1);
   float** const planes[] = {&ws.front, &ws.back, &ws.error, &ws.other};
   for (float** plane : planes) *plane = p, p += ws.plane;
-  ws.front_edges = reinterpret_cast<int16_t*>(p);
+  ws.count = reinterpret_cast<int32_t*>(p);
+  ws.front_edges = reinterpret_cast<int16_t*>(ws.count + ws.blocks);
   ws.back_edges = ws.front_edges + mesh.edges.count;
+  ws.marked = reinterpret_cast<uint8_t*>(ws.back_edges + mesh.edges.count);
+  ws.reached = ws.marked + size * ws.blocks;
   if (bytes) {
-    const char* end = reinterpret_cast<char*>(ws.back_edges + mesh.edges.count);
+    const char* end = reinterpret_cast<char*>(ws.reached + size * ws.blocks);
     *bytes = static_cast<size_t>((end - static_cast<char*>(memory) + 63) / 64 * 64);  // floats follow
   } else {
     filter.fill_taps(ws.taps);
@@ -178,41 +186,64 @@ bool render(const Mesh& mesh, Workspace& ws) {
   return most < kCovered ? most : 1;
 }
 
-// Filters a plane in place; `ws.other` is overwritten. The filter is its own transpose.
-void filter(Workspace& ws, float* plane) {
-  const int64_t size = ws.size, width = round_up(size);
+// Clears the rest of each line of `error`, and marks its blocks that are not 0.
+void mark(Workspace& ws) {
+  for (int64_t y = 0; y < ws.size; ++y) {
+    float* line = at(ws.error, ws, y);
+    fill(line + ws.size, ws.blocks * kLanes - ws.size, 0);
+    for (int64_t b = 0; b < ws.blocks; ++b) {
+      uint32_t any = 0;
+      for (int i = 0; i < kLanes; i += kWidth) any |= bits(greater(abs(load(line + b * kLanes + i)), all(kRounding)));
+      ws.marked[y * ws.blocks + b] = any != 0;
+    }
+  }
+}
+
+// Filters `error` in place at the marked blocks, and marks the blocks of the result; `other` is overwritten. The filter is
+// its own transpose.
+void filter(Workspace& ws) {
+  const int64_t size = ws.size, blocks = ws.blocks, r = ws.radius, reach = (r + kLanes - 1) / kLanes;
+  const auto add_marks = [&](int64_t y, int32_t times) {
+    for (int64_t b = 0; b < blocks && y >= 0 && y < size; ++b) ws.count[b] += times * ws.marked[y * blocks + b];
+  };
+  for (int64_t b = 0; b < blocks; ++b) ws.count[b] = 0;
+  for (int64_t y = 0; y < r; ++y) add_marks(y, 1);
   for (int64_t y = 0; y < size; ++y) {
-    float* to = at(ws.other, ws, y);
-    const int64_t first = y < ws.radius ? -y : -ws.radius, last = size - 1 - y < ws.radius ? size - 1 - y : ws.radius;
-    for (int64_t x = 0; x < width; x += kWidth) {
-      Vec sum = all(0.f);
-      for (int64_t k = first; k <= last; ++k)
-        sum = fma(all(ws.taps[k + ws.radius]), load(at(plane, ws, y + k) + x), sum);
-      store(to + x, sum);
+    add_marks(y + r, 1);
+    add_marks(y - r - 1, -1);
+    const int64_t first = y < r ? -y : -r, last = size - 1 - y < r ? size - 1 - y : r;
+    for (int64_t b = 0; b < blocks; ++b) {
+      ws.reached[y * blocks + b] = ws.count[b] > 0;
+      for (int64_t x = b * kLanes; x < (b + 1) * kLanes; x += kWidth) {
+        Vec sum = all(0.f);
+        for (int64_t k = first; ws.count[b] > 0 && k <= last; ++k)
+          sum = fma(all(ws.taps[k + r]), load(at(ws.error, ws, y + k) + x), sum);
+        store(at(ws.other, ws, y) + x, sum);
+      }
     }
   }
   for (int64_t y = 0; y < size; ++y) {
     float* from = ws.other + y * ws.stride;
-    fill(from, ws.radius, 0);
-    fill(from + ws.radius + size, ws.stride - ws.radius - size, 0);
-    float* to = at(plane, ws, y);
-    for (int64_t x = 0; x < width; x += kWidth) {
-      Vec sum = all(0.f);
-      for (int64_t k = 0; k <= 2 * ws.radius; ++k) sum = fma(all(ws.taps[k]), load(from + x + k), sum);
-      store(to + x, sum);
+    fill(from, r, 0);
+    fill(from + r + size, ws.stride - r - size, 0);
+    float* to = at(ws.error, ws, y);
+    for (int64_t b = 0; b < blocks; ++b) {
+      bool near = false;
+      for (int64_t n = b < reach ? 0 : b - reach; n <= b + reach && n < blocks; ++n) near |= ws.reached[y * blocks + n];
+      ws.marked[y * blocks + b] = near;
+      for (int64_t x = b * kLanes; x < (b + 1) * kLanes; x += kWidth) {
+        Vec sum = all(0.f);
+        for (int64_t k = 0; near && k <= 2 * r; ++k) sum = fma(all(ws.taps[k]), load(from + x + k), sum);
+        store(to + x, sum);
+      }
     }
-    fill(to + size, width - size, 0);
+    fill(to + size, blocks * kLanes - size, 0);
   }
 }
 
-// Adds the derivatives of Σ plane · coverage. Overwrites `front` and `back`.
-void add_gradient(const Mesh& mesh, Workspace& ws, const float* plane, float* gradient) {
+// Adds the derivatives of Σ error · coverage, over the pixels that are known.
+void add_gradient(const Mesh& mesh, const Workspace& ws, const uint8_t* target, float* gradient) {
   const int64_t size = ws.size;
-  for (int64_t i = 0; i < size * ws.stride; ++i) {
-    const float front = ws.front[i], back = ws.closed ? front : ws.back[i];
-    ws.front[i] = front >= back && front < kCovered ? plane[i] : 0;
-    if (!ws.closed) ws.back[i] = back > front && back < kCovered ? plane[i] : 0;
-  }
   for (int64_t e = 0; e < mesh.edges.count; ++e) {
     const float front = ws.front_edges[e], back = ws.back_edges[e];
     if (front == 0 && back == 0) continue;
@@ -221,7 +252,10 @@ void add_gradient(const Mesh& mesh, Workspace& ws, const float* plane, float* gr
     walk(s, size, [&](int64_t column, int64_t row, float t0, float t1) __attribute__((always_inline)) {
       if (column < 0 || column >= size || row < 0 || row >= size) return;
       const int64_t i = row * ws.stride + ws.radius + column;
-      const float factor = (front * ws.front[i] + (ws.closed ? 0 : back * ws.back[i])) * (t1 - t0);
+      const float of_front = ws.front[i], of_back = ws.closed ? of_front : ws.back[i];
+      const bool in_front = of_front >= of_back;
+      if (!((in_front ? of_front : of_back) < kCovered) || (target && target[row * size + column] == kUnknown)) return;
+      const float factor = (in_front ? front : back) * ws.error[i] * (t1 - t0);
       const float middle = 0.5f * (t0 + t1);
       to_a += factor * (1 - middle);
       to_b += factor * middle;
@@ -234,22 +268,13 @@ void add_gradient(const Mesh& mesh, Workspace& ws, const float* plane, float* gr
   clear_far_gradient(mesh, gradient);
 }
 
-[[gnu::always_inline]] inline bool known(Target target, int64_t i) { return !target.bytes || target.bytes[i] != kUnknown; }
-
-[[gnu::always_inline]] inline float value_of(Target target, int64_t i) {
-  return target.bytes ? (target.bytes[i] == kBackground ? 0.f : 1.f) : target.floats[i];
-}
-
-// Clears a plane with its margins.
-[[gnu::always_inline]] inline void clear(float* plane, const Workspace& ws) { fill(plane, ws.size * ws.stride, 0); }
-
 void silhouette(const Mesh& mesh, Blur blur, int64_t size, void* memory, float* image) {
   Workspace ws = carve(mesh, blur, size, memory);
   if (!render(mesh, ws)) return fill(image, size * size, __builtin_nanf(""));
-  clear(ws.error, ws);
   for (int64_t y = 0; y < size; ++y)
     for (int64_t x = 0; x < size; ++x) at(ws.error, ws, y)[x] = coverage_at(ws, y * ws.stride + ws.radius + x);
-  filter(ws, ws.error);
+  mark(ws);
+  filter(ws);
   for (int64_t y = 0; y < size; ++y)
     for (int64_t x = 0; x < size; ++x) image[y * size + x] = at(ws.error, ws, y)[x];
 }
@@ -258,12 +283,12 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
                          float* gradient) {
   Workspace ws = carve(mesh, blur, size, memory);
   if (!render(mesh, ws)) return set_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
-  clear(ws.error, ws);
   for (int64_t y = 0; y < size; ++y)
     for (int64_t x = 0; x < size; ++x) at(ws.error, ws, y)[x] = cotangent[y * size + x];
-  filter(ws, ws.error);
+  mark(ws);
+  filter(ws);
   set_gradient(gradient, mesh.num_vertices, 0);
-  add_gradient(mesh, ws, ws.error, gradient);
+  add_gradient(mesh, ws, nullptr, gradient);
 }
 
 // Rows d coverage / d parameters of the pixels at the outline, in the order of the pixels.
@@ -271,8 +296,11 @@ struct Rows {
   float *values, *filtered;  // (limit, D); `filtered` has the rows of FᵀF · values, with the filter F
   int32_t* of_pixel;         // (size, size): the row of a pixel, -1 without one
   int32_t *pixel, *order;    // (limit): the pixel of each row; the rows in the order of the pixels
-  int32_t* line;             // (size + 1): the first place in `order` of each line of the image
-  float* overlap;            // (size, 2·radius + 1): products of the taps at a pixel and at 0, 1, … pixels beyond
+  int32_t *line, *column;    // (size + 1): the first place in `order` of each line; (limit): the column of each place
+  int32_t* first;            // (size): the first place of each line that is near
+  float* overlap;            // (size, 4·radius + 1): entries of FᵀF along one axis
+  int32_t* near;             // (limit): the rows whose pixels are near that of one row, with their entries of FᵀF
+  float* weights;
   VertexRows of_vertex;
   int64_t count, limit;
 };
@@ -286,12 +314,16 @@ struct Rows {
   rows.values = p, p += rows.limit * D;
   rows.filtered = p, p += rows.limit * D;
   rows.of_vertex.values = p, p += 2 * mesh.num_vertices * D;
-  rows.overlap = p, p += size * (2 * ws.radius + 1);
+  rows.overlap = p, p += size * (4 * ws.radius + 1);
+  rows.weights = p, p += rows.limit;
   int32_t* q = reinterpret_cast<int32_t*>(p);
   rows.of_pixel = q, q += size * size;
   rows.pixel = q, q += rows.limit;
   rows.order = q, q += rows.limit;
+  rows.near = q, q += rows.limit;
+  rows.column = q, q += rows.limit;
   rows.line = q, q += size + 1;
+  rows.first = q, q += size;
   rows.of_vertex.ready = reinterpret_cast<uint8_t*>(q);
   if (bytes) *bytes = reinterpret_cast<char*>(q) - static_cast<char*>(memory) + mesh.num_vertices;
   return rows;
@@ -340,39 +372,86 @@ void fill_rows(const Mesh& mesh, const Skin& skin, const Workspace& ws, const ui
   }
 }
 
+// Puts the rows into the order of their pixels: by lines, then by insertion within each line, which has few.
+void sort_rows(int64_t size, Rows& rows) {
+  for (int64_t y = 0; y <= size; ++y) rows.line[y] = 0;
+  for (int64_t row = 0; row < rows.count; ++row) ++rows.line[rows.pixel[row] / size + 1];
+  int32_t before = 0;
+  for (int64_t y = 1; y <= size; ++y) {
+    const int32_t own = rows.line[y];
+    rows.line[y] = before, before += own;
+  }
+  for (int64_t row = 0; row < rows.count; ++row)
+    rows.order[rows.line[rows.pixel[row] / size + 1]++] = static_cast<int32_t>(row);
+  for (int64_t y = 0; y < size; ++y)
+    for (int32_t n = rows.line[y] + 1; n < rows.line[y + 1]; ++n) {
+      const int32_t row = rows.order[n];
+      int32_t place = n;
+      for (; place > rows.line[y] && rows.pixel[rows.order[place - 1]] > rows.pixel[row]; --place)
+        rows.order[place] = rows.order[place - 1];
+      rows.order[place] = row;
+    }
+}
+
+// to = Σ weights[n] · rows[near[n]], n registers of each row.
+template <int n>
+[[gnu::always_inline]] inline void add_weighted(const float* rows, const int32_t* near, const float* weights,
+                                                int64_t count, int64_t D, float* to) {
+  Vec sums[n];
+  for (int c = 0; c < n; ++c) sums[c] = all(0.f);
+  for (int64_t i = 0; i < count; ++i) {
+    const float* from = rows + near[i] * D;
+    for (int c = 0; c < n; ++c) sums[c] = fma(all(weights[i]), load(from + c * kWidth), sums[c]);
+  }
+  for (int c = 0; c < n; ++c) store(to + c * kWidth, sums[c]);
+}
+
+// Fills `overlap`: the entries of FᵀF along one axis, of a pixel and each pixel within twice the radius.
+void fill_overlap(const Workspace& ws, Rows& rows) {
+  const int64_t size = ws.size, r = ws.radius, reach = 2 * r, width = 2 * reach + 1;
+  for (int64_t u = 0; u < size; ++u)
+    for (int64_t k = -reach; k <= reach; ++k) {
+      float* to = rows.overlap + u * width + reach + k;
+      *to = 0;
+      if (u > reach && u + reach < size) {  // far from both ends, as at the pixel before
+        *to = to[-width];
+        continue;
+      }
+      for (int64_t v = (k < 0 ? u : u + k) - r; v <= (k < 0 ? u + k : u) + r; ++v)
+        if (v >= 0 && v < size) *to += ws.taps[v - u + r] * ws.taps[v - u - k + r];
+    }
+}
+
 // Fills `filtered`. Only pairs of rows within twice the radius of the filter have an entry of FᵀF that is not 0.
 void filter_rows(const Workspace& ws, int64_t D, Rows& rows) {
-  const int64_t size = ws.size, r = ws.radius, reach = 2 * r;
-  for (int64_t u = 0; u < size; ++u)
-    for (int64_t k = 0; k <= reach; ++k) {
-      float sum = 0;
-      for (int64_t v = u + k - r; v <= u + r; ++v)
-        if (v >= 0 && v < size) sum += ws.taps[v - u + r] * ws.taps[v - u - k + r];
-      rows.overlap[u * (reach + 1) + k] = sum;
-    }
-  const auto overlap = [&](int64_t u, int64_t v) {
-    return u < v ? rows.overlap[u * (reach + 1) + v - u] : rows.overlap[v * (reach + 1) + u - v];
-  };
-  int32_t place = 0;
+  const int64_t size = ws.size, reach = 2 * ws.radius, width = 2 * reach + 1;
+  fill_overlap(ws, rows);
+  sort_rows(size, rows);
+  for (int64_t y = 0; y < size; ++y)
+    for (int32_t n = rows.line[y]; n < rows.line[y + 1]; ++n)
+      rows.column[n] = static_cast<int32_t>(rows.pixel[rows.order[n]] - y * size);
   for (int64_t y = 0; y < size; ++y) {
-    rows.line[y] = place;
-    for (int64_t x = 0; x < size; ++x)
-      if (rows.of_pixel[y * size + x] >= 0) rows.order[place++] = rows.of_pixel[y * size + x];
-  }
-  rows.line[size] = place;
-  for (int64_t row = 0; row < rows.count; ++row) {
-    float* to = rows.filtered + row * D;
-    fill(to, D, 0);
-    const int64_t x = rows.pixel[row] % size, y = rows.pixel[row] / size;
     const int64_t top = y < reach ? 0 : y - reach, bottom = y + reach < size ? y + reach : size - 1;
-    for (int64_t line = top; line <= bottom; ++line) {
-      const float down = overlap(y, line);
-      for (int32_t n = rows.line[line]; n < rows.line[line + 1]; ++n) {
-        const int64_t other = rows.order[n], column = rows.pixel[other] % size;
-        if (column < x - reach || column > x + reach) continue;
-        const Vec weight = all(down * overlap(x, column));
-        const float* from = rows.values + other * D;
-        for (int64_t d = 0; d < D; d += kWidth) store(to + d, fma(weight, load(from + d), load(to + d)));
+    for (int64_t line = top; line <= bottom; ++line) rows.first[line] = rows.line[line];
+    for (int32_t place = rows.line[y]; place < rows.line[y + 1]; ++place) {
+      const int64_t x = rows.column[place];
+      const float *down = rows.overlap + y * width + reach - y, *along = rows.overlap + x * width + reach - x;
+      int64_t count = 0;
+      for (int64_t line = top; line <= bottom; ++line) {
+        int32_t& first = rows.first[line];  // the places of a line come in the order of x
+        const int32_t end = rows.line[line + 1];
+        while (first < end && rows.column[first] < x - reach) ++first;
+        for (int32_t n = first; n < end && rows.column[n] <= x + reach; ++n) {
+          rows.near[count] = rows.order[n];
+          rows.weights[count++] = down[line] * along[rows.column[n]];
+        }
+      }
+      float* to = rows.filtered + rows.order[place] * D;
+      for (int64_t d = 0; d < D;) {
+        const bool several = D - d >= kColumns * kWidth;
+        if (several) add_weighted<kColumns>(rows.values + d, rows.near, rows.weights, count, D, to + d);
+        else add_weighted<1>(rows.values + d, rows.near, rows.weights, count, D, to + d);
+        d += several ? kColumns * kWidth : kWidth;
       }
     }
   }
@@ -387,44 +466,51 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
     if (block) fill(block, skin->parameters * skin->parameters, *loss);
     return;
   }
-  if (block) {  // before the gradient, which overwrites the means
+  if (block) {
     Rows rows = carve_rows(mesh, *skin, ws, memory, workspace(mesh, blur, size));
     fill_rows(mesh, *skin, ws, target.bytes, rows);
     filter_rows(ws, skin->parameters, rows);
     multiply_rows(rows.values, rows.filtered, rows.count, skin->parameters, block);
   }
-  clear(ws.error, ws);
-  for (int64_t y = 0; y < size; ++y)
-    for (int64_t x = 0; x < size; ++x) {
-      const int64_t i = y * size + x;
-      if (!known(target, i)) continue;
-      at(ws.error, ws, y)[x] = coverage_at(ws, y * ws.stride + ws.radius + x) - value_of(target, i);
-    }
-  filter(ws, ws.error);
-  double total = 0;
   for (int64_t y = 0; y < size; ++y) {
     float* error = at(ws.error, ws, y);
-    float of_row = 0;
-    for (int64_t x = 0; x < size; ++x) {
-      const float e = error[x], magnitude = __builtin_fabsf(e);
-      if (kind == LossKind::kL1) {
-        of_row += magnitude;
-        error[x] = e > 0 ? 1.f : e < 0 ? -1.f : 0.f;
-      } else {
-        of_row += magnitude > 1 ? magnitude - 0.5f : 0.5f * e * e;
-        error[x] = e > 1 ? 1.f : e < -1 ? -1.f : e;
+    const int64_t line = y * ws.stride + ws.radius;
+    for (int64_t x = 0; x < size; ++x) error[x] = coverage_at(ws, line + x);
+    if (target.bytes) {
+      const uint8_t* own = target.bytes + y * size;
+      for (int64_t x = 0; x < size; ++x)
+        error[x] = own[x] == kUnknown ? 0.f : error[x] - (own[x] == kBackground ? 0.f : 1.f);
+    } else {
+      for (int64_t x = 0; x < size; ++x) error[x] -= target.floats[y * size + x];
+    }
+  }
+  mark(ws);
+  filter(ws);
+  double total = 0;
+  const Vec zero = all(0.f), half = all(0.5f), one = all(1.f);
+  for (int64_t y = 0; y < size; ++y) {
+    Vec of_line = zero;
+    for (int64_t b = 0; b < ws.blocks; ++b) {
+      if (!ws.marked[y * ws.blocks + b]) continue;
+      for (int i = 0; i < kLanes; i += kWidth) {
+        float* place = at(ws.error, ws, y) + b * kLanes + i;
+        const Vec error = load(place), magnitude = abs(error);
+        if (kind == LossKind::kL1) {
+          of_line = of_line + magnitude;
+          store(place, flip_sign(keep(greater(magnitude, zero), one), error));
+        } else {
+          of_line = of_line + select(greater(magnitude, one), magnitude - half, half * error * error);
+          store(place, clamp_to(error, one));
+        }
       }
     }
-    total += of_row;
+    total += sum(of_line);
   }
   *loss = static_cast<float>(total);
   if (!gradient) return;
-  filter(ws, ws.error);
-  for (int64_t y = 0; y < size; ++y)
-    for (int64_t x = 0; x < size; ++x)
-      if (!known(target, y * size + x)) at(ws.error, ws, y)[x] = 0;
+  filter(ws);
   set_gradient(gradient, mesh.num_vertices, 0);
-  add_gradient(mesh, ws, ws.error, gradient);
+  add_gradient(mesh, ws, target.bytes, gradient);
 }
 
 }  // namespace
