@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from jaxfit.fitting.posterior import with_shared
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program
 from jaxfit.fitting.solve import (
     FitModel,
+    Report,
     advance,
     begin,
     needs_mask,
@@ -33,12 +34,14 @@ from jaxfit.fitting.solve import (
 )
 from jaxfit.fitting.tiles import join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.foundation.progress import ReportProgress
+from jaxfit.foundation.threads import in_threads, usable_cores
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.posed_window import Targets
 
 _logger = logging.getLogger(__name__)
 
+A = TypeVar("A")
 SECONDS_PER_CALL = 1.0
 """Target duration of some steps of all tiles. After these steps, progress is reported."""
 
@@ -134,7 +137,12 @@ def fit_batch(
         rows = _take_steps(run, rows, carries, report_progress)
         if i < last and not (stage.keep_best and rows.count > 1):
             continue
-        final = run.joined(report(program, p, take_tile(rows.pose, tile)) for p, tile in run.tiles)
+        pose = rows.pose
+
+        def reported(p: Problem, tile: np.ndarray, program: Program = program, pose: Pose = pose) -> Report:
+            return report(program, p, take_tile(pose, tile))
+
+        final = run.joined(run.of_tiles(reported))
         if i == last:
             step = np.where(np.isfinite(sum(final.loss.values())), 0, stage.steps)
             rows = _name_failures(run, rows, step)
@@ -143,12 +151,8 @@ def fit_batch(
     bars = body = None
     if stage.share_body:
         run = _stage_run(stage, program, rows, hyperparameters, batch, first)
-        parts = []
-        for p, tile in run.tiles:
-            evidence, reasons = body_evidence(program, p, take_tile(rows.pose, tile))
-            parts.append(jax.tree.map(lambda *x: np.stack(x), *evidence))
-            _report_reasons("a window says nothing about the body of its bird", rows, tile, reasons)
-        body = run.joined(parts)
+        found = run.of_tiles(lambda p, tile: body_evidence(program, p, take_tile(rows.pose, tile)))
+        body = _stacked(run, rows, found, "a window says nothing about the body of its bird")
     elif configs[0].error_bars:
         covariance, used = None, stage
         if batch.body_covariance is not None:
@@ -175,6 +179,14 @@ class _StageRun(NamedTuple):
     """The problems of each tile: one for every hypothesis of every row; and their positions, −1 for no problem."""
     count: int
     """Number of problems."""
+
+    def of_tiles(self, function: Callable[..., A], *others: Sequence[Any]) -> list[A]:
+        """Return a function of the problems, the positions and one item of each of `others` of every tile.
+
+        Threads compute some tiles at the same time, because not all steps of a computation use several cores.
+        """
+        items = zip(*zip(*self.tiles, strict=True), *others, strict=True)
+        return list(in_threads(lambda item: jax.block_until_ready(function(*item)), items, usable_cores()))
 
     def joined(self, parts: Iterable[Any]) -> Any:
         """Return the results of all tiles as NumPy arrays, one row for each problem."""
@@ -223,8 +235,8 @@ def _take_steps(run: _StageRun, rows: Hypotheses, carries: bool, report_progress
     while done < stage.steps:
         take = min(chunk, stage.steps - done)
         start = time.perf_counter()
-        pairs = zip(run.tiles, states, strict=True)
-        advanced = [advance((program, p, jnp.int32(take)), state) for (p, _), state in pairs]
+        steps = jnp.int32(take)
+        advanced = run.of_tiles(lambda p, _, state, steps=steps: advance((program, p, steps), state), states)
         states, losses, rejected = (list(parts) for parts in zip(*advanced, strict=True))
         mean_loss = np.mean(run.joined(losses))  # waits for the result
         seconds = time.perf_counter() - start
@@ -257,17 +269,18 @@ def _error_bars(
     run: _StageRun, rows: Hypotheses, common_size: bool, body_covariance: Float[np.ndarray, "R P P"] | None
 ) -> ErrorBars:
     """Return the error bars of all rows, and log why a row that did not diverge has none."""
-    parts = []
-    for p, tile in run.tiles:
+
+    def of_tile(p: Problem, tile: np.ndarray) -> tuple[list[ErrorBars], list[str]]:
         of_bodies = None if body_covariance is None else take_tile(body_covariance, tile)
-        bars, reasons = window_error_bars(run.program, p, take_tile(rows.pose, tile), common_size, of_bodies)
-        parts.append(jax.tree.map(lambda *x: np.stack(x), *bars))
-        _report_reasons("a window has no error bars", rows, tile, reasons)
-    return run.joined(parts)
+        return window_error_bars(run.program, p, take_tile(rows.pose, tile), common_size, of_bodies)
+
+    return _stacked(run, rows, run.of_tiles(of_tile), "a window has no error bars")
 
 
-def _report_reasons(what: str, rows: Hypotheses, tile: Int[np.ndarray, "G"], reasons: Sequence[str]) -> None:
-    """Log the reasons of the rows of a tile that did not diverge."""
-    for row, reason in zip(tile.tolist(), reasons, strict=True):
-        if row >= 0 and reason and not rows.failure[row]:
-            _logger.warning("%s: %s", what, reason)
+def _stacked(run: _StageRun, rows: Hypotheses, found: Sequence[tuple[Sequence[Any], Sequence[str]]], what: str) -> Any:
+    """Return the results of the problems of all tiles, and log the reasons of rows that did not diverge."""
+    for (_, tile), (_, reasons) in zip(run.tiles, found, strict=True):
+        for row, reason in zip(tile.tolist(), reasons, strict=True):
+            if row >= 0 and reason and not rows.failure[row]:
+                _logger.warning("%s: %s", what, reason)
+    return run.joined(jax.tree.map(lambda *x: np.stack(x), *results) for results, _ in found)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.metadata
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -60,22 +61,26 @@ class StoredProgram:
         self._reuses_state = reuses_state
         self._compiled = eqx.filter_jit(function, donate="all-except-first" if reuses_state else "none")
         self._loaded: dict[str, Callable[..., list]] = {}
+        self._loading = threading.Lock()  # threads that need a program at the same time compile it once
         functools.update_wrapper(self, function)
 
     def __call__(self, *all_arguments: Any) -> Any:
         arguments, others = eqx.partition(all_arguments, eqx.is_array)
         key = _key(self._function, arguments, others)
         if key is None:
-            return self._compiled(*all_arguments)
+            with self._loading:
+                return self._compiled(*all_arguments)
         leaves = [jax.tree.leaves(part) for part in arguments]
-        if key not in self._loaded:
-            if len(self._loaded) == MAX_LOADED:
-                self._loaded.pop(next(iter(self._loaded)))
-            program = self._traced(key, leaves, [*map(jax.tree.structure, arguments)], others)
-            call = functools.update_wrapper(lambda *leaves: program.call(*leaves), self._function)
-            # a jitted function would be compiled once more for its own results, which are bound to a device
-            self._loaded[key] = jax.jit(call, donate_argnums=(1,) * self._reuses_state).lower(*leaves).compile()
-        result = self._loaded[key](*leaves)
+        with self._loading:
+            if key not in self._loaded:
+                if len(self._loaded) == MAX_LOADED:
+                    self._loaded.pop(next(iter(self._loaded)))
+                program = self._traced(key, leaves, [*map(jax.tree.structure, arguments)], others)
+                call = functools.update_wrapper(lambda *leaves: program.call(*leaves), self._function)
+                # a jitted function would be compiled once more for its own results, which are bound to a device
+                self._loaded[key] = jax.jit(call, donate_argnums=(1,) * self._reuses_state).lower(*leaves).compile()
+            compiled = self._loaded[key]
+        result = compiled(*leaves)
         return jax.tree.unflatten(jax.tree.structure(self._structure(*all_arguments)), result)
 
     def _traced(self, key: str, leaves: list, structures: list, others: Any) -> jax.export.Exported:

@@ -13,7 +13,7 @@ B = TypeVar("B")
 
 
 MAX_AT_ONCE = 8
-"""Largest number of frames that threads work on at the same time, to bound the memory."""
+"""Largest number of items that threads work on at the same time, to bound the memory."""
 
 
 def usable_cores() -> int:
