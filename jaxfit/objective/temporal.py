@@ -22,7 +22,7 @@ from jaxfit.objective.residuals import NORM, Residuals, Scalar, huber
 @term
 def velocity(
     window: PosedWindow, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0
-) -> tuple[Residuals, Residuals]:
+) -> tuple[Residuals, ...]:
     """Penalise the velocity of the pose: E_vel = Σ_k β_k Σ_i ‖θ_k,i+1 − θ_k,i‖₂ over k = global orientation, body pose.
 
     Source: Hägerlind et al. 2024, velocity term; norms not squared.
@@ -33,7 +33,7 @@ def velocity(
 @term
 def acceleration(
     window: PosedWindow, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0
-) -> tuple[Residuals, Residuals]:
+) -> tuple[Residuals, ...]:
     """Penalise the acceleration of the pose: E_acc = Σ_k β_k Σ_i ‖θ′_k,i+1 − θ′_k,i‖₂.
 
     θ′ is the difference of consecutive frames.
@@ -45,7 +45,7 @@ def acceleration(
 
 def _differences(
     window: PosedWindow, order: int, beta_global: Scalar | float, beta_pose: Scalar | float
-) -> tuple[Residuals, Residuals]:
+) -> tuple[Residuals, ...]:
     frames = window.pose.global_orient.shape[0]
     complete = jnp.asarray(complete_runs(window.present, order), jnp.float32)
     orient = jnp.diff(window.pose.global_orient, order, axis=0)
@@ -69,7 +69,7 @@ BUTTERWORTH_ORDER = 4
 @term
 def geodesic_velocity(
     window: PosedWindow, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0
-) -> tuple[Residuals, Residuals]:
+) -> tuple[Residuals, ...]:
     """Penalise the geodesic distance between the poses of consecutive frames.
 
     E = Σ_i β_g · d(G_i, G_i+1) + β_p · √(Σ_j d(R_j,i, R_j,i+1)²), with d the angle between two rotations, G the global
@@ -95,7 +95,7 @@ def huber_velocity(
     delta_rad: Scalar | float = 0.1,
     beta_global: Scalar | float = 10.0,
     beta_pose: Scalar | float = 1.0,
-) -> tuple[Residuals, Residuals]:
+) -> tuple[Residuals, ...]:
     """Penalise the rotation of every joint between consecutive frames by Huber's loss.
 
     E = Σ_i β_g · h(d(G_i, G_i+1)) + β_p · Σ_j h(d(R_j,i, R_j,i+1)), with h Huber's loss and δ in radians per frame.
@@ -128,7 +128,7 @@ def low_pass(
     cutoff_cycles_per_frame: Scalar | float = 0.15,
     beta_global: Scalar | float = 1.0,
     beta_pose: Scalar | float = 1.0,
-) -> tuple[Residuals, Residuals]:
+) -> tuple[Residuals, ...]:
     """Penalise the energy of motion above a cut-off frequency, rad².
 
     E = Σ_k w_k (β_g ‖ĝ_k‖² + β_p ‖θ̂_k‖²), where ĝ_k and θ̂_k are the coefficients of the orthonormal DCT-II over the
