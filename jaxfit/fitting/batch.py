@@ -42,6 +42,8 @@ from jaxfit.objective.posed_window import Targets
 _logger = logging.getLogger(__name__)
 
 A = TypeVar("A")
+TILES_AT_ONCE = 2
+"""Most tiles that are computed at the same time. Each needs its own memory, and most parts of a step use all cores."""
 SECONDS_PER_CALL = 1.0
 """Target duration of some steps of all tiles. After these steps, progress is reported."""
 
@@ -186,7 +188,9 @@ class _StageRun(NamedTuple):
         Threads compute some tiles at the same time, because not all steps of a computation use several cores.
         """
         items = zip(*zip(*self.tiles, strict=True), *others, strict=True)
-        return list(in_threads(lambda item: jax.block_until_ready(function(*item)), items, usable_cores()))
+        return list(
+            in_threads(lambda item: jax.block_until_ready(function(*item)), items, min(usable_cores(), TILES_AT_ONCE))
+        )
 
     def joined(self, parts: Iterable[Any]) -> Any:
         """Return the results of all tiles as NumPy arrays, one row for each problem."""
