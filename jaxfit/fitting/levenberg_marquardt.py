@@ -15,9 +15,9 @@ from jaxfit.objective.curvature import FrameBlocks, Rows, add_rows, frame_rows, 
 from jaxfit.objective.objective import evaluate_curvature, sum_with_blocks
 
 CG_STEPS, CG_STEPS_SHARED, CG_TOLERANCE = 30, 100, 0.01
-"""Largest number of conjugate-gradient steps within one step, the same where parameters are shared by all frames, which
-the preconditioner does not couple with the frames, and the relative residual at which they end. The first steps need few
-of them. A tolerance far below 1e-6 makes single precision underflow to 0/0."""
+"""Largest number of conjugate-gradient steps within one step, the same where frames share optimised parameters, which
+the preconditioner does not couple with the frames, and the relative residual at which they end. The first steps need
+few. A tolerance far below 1e-6 makes single precision underflow to 0/0."""
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-2, 1e-5, 1e8
 """The damping μ of the first step, and the bounds of μ."""
 DAMPING_DECREASE, DAMPING_INCREASE = 0.2, 5.0
