@@ -14,10 +14,11 @@ from jaxfit.model.kinematics import Pose
 from jaxfit.objective.curvature import FrameBlocks, Rows, add_rows, frame_rows, pentadiagonal_solver, shared_columns
 from jaxfit.objective.objective import evaluate_curvature, sum_with_blocks
 
-CG_STEPS, CG_STEPS_SHARED, CG_TOLERANCE = 30, 100, 0.01
-"""Largest number of conjugate-gradient steps within one step, the same where frames share optimised parameters, which
-the preconditioner does not couple with the frames, and the relative residual at which they end. The first steps need
-few. A tolerance far below 1e-6 makes single precision underflow to 0/0."""
+CG_STEPS, CG_STEPS_UNCOUPLED, CG_TOLERANCE = 30, 100, 0.01
+"""Largest number of conjugate-gradient steps within one step; the same where the preconditioner does not know the
+couplings that matter, those of frames with optimised parameters that they share, and those within a single frame; and
+the relative residual at which they end. The first steps need few. A tolerance far below 1e-6 makes single precision
+underflow to 0/0."""
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-2, 1e-5, 1e8
 """The damping μ of the first step, and the bounds of μ."""
 DAMPING_DECREASE, DAMPING_INCREASE = 0.2, 5.0
@@ -98,12 +99,13 @@ def _levenberg_step(
     # terms of motion hold most of H where a bird is at rest.
     bands = jnp.where(optimised & ~is_shared, curvature.bands, 0.0)
     precondition = pentadiagonal_solver((1 + state.damping) * diagonal, bands)
+    coupled = len(optimised) > 2 and not program.shared
     newton, _ = cg(
         lambda d: allowed(curvature.product(d)) + state.damping * diagonal * d,
         -gradient,
         M=precondition,
         tol=CG_TOLERANCE,
-        maxiter=CG_STEPS_SHARED if program.shared else CG_STEPS,
+        maxiter=CG_STEPS if coupled else CG_STEPS_UNCOUPLED,
     )
     # H bounds the objective from above, so its step is too short where κ < 1: over-relaxation by 1/κ, with momentum
     pessimistic = state.curvature_ratio < PESSIMISTIC

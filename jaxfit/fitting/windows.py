@@ -429,7 +429,7 @@ def _cut_masks(
         cuts[t] = cut_mask(next(decoded), crop[t], cuts.shape[-1])
     for t in rows:
         if others[t] is not False:
-            mark_unknown(cuts[t], next(decoded) if t in near else None, own[t]["size"], crop[t])
+            mark_unknown(cuts[t], next(decoded) if t in near else None, tuple(own[t]["size"]), crop[t])
 
 
 def _timeline(observations: Observations) -> Int[np.ndarray, "L"]:

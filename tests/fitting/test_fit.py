@@ -1,7 +1,6 @@
 """The whole fit: it recovers a known truth, birds are independent, and the batch size does not change the result."""
 
 import dataclasses
-import logging
 from contextlib import contextmanager
 
 import jax
@@ -177,18 +176,16 @@ def test_missing_frames_have_no_valid_pose(observed):
     assert np.isnan(result.poses.global_orient[0, [0, 3]]).all()
 
 
-def test_the_batch_size_does_not_change_the_result(observed, short, caplog):
+def test_the_batch_size_does_not_change_the_result(observed, short, compilations):
     """One batch or several batches give the same result, and no program is recompiled."""
     large = config(steps=SHORT, memory_gb=2 * ONE_WINDOW_GB)
     assert [frames_per_batch(BIRD, c) // T for c in (config(), large)] == [1, 2]
-    with caplog.at_level(logging.WARNING), jax.log_compiles():
-        for birds in (2, 3):
-            result = fit(observed.select(tracks=slice(birds)), BIRD, large)
-            assert_same(result, short, slice(birds))
-            for term, loss in result.loss.items():
-                np.testing.assert_array_equal(short.loss[term][:birds], loss, err_msg=term)
-    compiled = [r.getMessage() for r in caplog.records if r.getMessage().startswith("Compiling")]
-    assert not [m for m in compiled if any(name in m for name in ("advance", "begin", "report", "initial"))]
+    for birds in (2, 3):
+        result = fit(observed.select(tracks=slice(birds)), BIRD, large)
+        assert_same(result, short, slice(birds))
+        for term, loss in result.loss.items():
+            np.testing.assert_array_equal(short.loss[term][:birds], loss, err_msg=term)
+    assert not [m for m in compilations() if any(name in m for name in ("advance", "begin", "report", "initial"))]
 
 
 def in_a_large_image(observations, corner=(210, 90), size=(400, 300)):

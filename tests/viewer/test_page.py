@@ -391,9 +391,9 @@ def test_the_page_says_why_and_marks_the_worst_keypoint(page):
     opened.until("document.querySelector('#why h2')?.textContent === 'Bird 4: no flag'")
     name = opened.page.inner_text("#why table:last-child tr:nth-child(2) td")
     k = [each.replace("_", " ") for each in viewer.results[0].solution.keypoint_names].index(name)
-    opened.until(f"jaxfit.state.columns[0].films[0].marked.k === {k}")
+    opened.until(f"jaxfit.state.columns[0].films[0].marked?.k === {k}")
     opened.page.hover("#why table:last-child tr:nth-child(3)")
-    opened.until(f"jaxfit.state.columns[0].films[0].marked.k !== {k}")
+    opened.until(f"jaxfit.state.columns[0].films[0].marked?.k !== {k}")
     opened.page.keyboard.press("ArrowDown")
     opened.go(2)  # the second bird has no pose
     opened.until("document.querySelector('#why h2').textContent === 'Bird 11: no pose'")
