@@ -138,10 +138,9 @@ def _contradict(observations: Observations, cells: Sequence[tuple[int, int]]) ->
     def too_many(outside: Bool[np.ndarray, "D K"]) -> Bool[np.ndarray, "D"]:
         return outside.sum(1) / np.maximum(sure.sum(1), 1) > OUTSIDE_SHARE
 
-    limit_px = WRONG_SHARE * observations.box_px[index][:, 2:].max(1).astype(np.float64)
-    starts = np.searchsorted(runs.mask, np.arange(len(masks) + 1))
+    starts, limit_px = runs.starts, WRONG_SHARE * observations.box_px[index][:, 2:].max(1).astype(np.float64)
     for d in np.flatnonzero(too_many(beside)).tolist():  # the keypoints of most birds lie in their masks
-        own = runs.pixels[starts[d] : starts[d + 1]]
+        own = runs.pixels[slice(*starts[d : d + 2])]
         k = np.flatnonzero(beside[d])
         if len(own):
             distance_px = _distances_px(column[d, k], row[d, k], own, int(height[d, 0]))

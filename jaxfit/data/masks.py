@@ -46,13 +46,13 @@ def decode_columns(
         columns: the first column, and the column after the last, of each mask.
     """
     runs = foreground_runs(masks)
-    ends = np.searchsorted(runs.mask, np.arange(len(masks) + 1)).tolist()
+    starts = runs.starts
     for i, (rle, wanted) in enumerate(zip(masks, columns, strict=True)):
         height, width = rle["size"]
         left, right = (min(max(column, 0), width) * height for column in wanted)
         mask = np.zeros((width, height), bool)  # run lengths go column by column; untouched rows take no memory
         pixels = mask.reshape(-1)
-        for start, end in np.clip(runs.pixels[ends[i] : ends[i + 1]], left, right).tolist():
+        for start, end in np.clip(runs.pixels[slice(*starts[i : i + 2])], left, right).tolist():
             pixels[start:end] = True
         yield mask.T
 

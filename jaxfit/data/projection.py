@@ -102,10 +102,9 @@ def in_image(
     known = middle_of_crop if of_camera else s.crops.image_size_px[at] / 2
     centre = known if centre_px is None else np.asarray(centre_px)
     ray = np.concatenate([(pixel - centre) / focal, np.ones((len(root), 1))], axis=1)
-    turn = scipy.spatial.transform.Rotation.from_rotvec(_between(root, ray))
-    orient = (
-        turn * scipy.spatial.transform.Rotation.from_rotvec(s.poses.global_orient[at].astype(np.float64))
-    ).as_rotvec()
+    rotation = scipy.spatial.transform.Rotation.from_rotvec
+    turn = rotation(_between(root, ray))
+    orient = (turn * rotation(s.poses.global_orient[at].astype(np.float64))).as_rotvec()
 
     def everywhere(values: np.ndarray) -> np.ndarray:
         filled = np.full((*s.valid.shape, *values.shape[1:]), np.nan)

@@ -22,7 +22,6 @@ from jaxfit.fitting.posterior import with_shared
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program
 from jaxfit.fitting.solve import (
     FitModel,
-    Report,
     advance,
     begin,
     needs_mask,
@@ -139,12 +138,7 @@ def fit_batch(
         rows = _take_steps(run, rows, carries, report_progress)
         if i < last and not (stage.keep_best and rows.count > 1):
             continue
-        pose = rows.pose
-
-        def reported(p: Problem, tile: np.ndarray, program: Program = program, pose: Pose = pose) -> Report:
-            return report(program, p, take_tile(pose, tile))
-
-        final = run.joined(run.of_tiles(reported))
+        final = run.joined(run.of_tiles(report, run.taken(rows.pose)))
         if i == last:
             step = np.where(np.isfinite(sum(final.loss.values())), 0, stage.steps)
             rows = _name_failures(run, rows, step)
@@ -153,7 +147,7 @@ def fit_batch(
     bars = body = None
     if stage.share_body:
         run = _stage_run(stage, program, rows, hyperparameters, batch, first)
-        found = run.of_tiles(lambda p, tile: body_evidence(program, p, take_tile(rows.pose, tile)))
+        found = run.of_tiles(body_evidence, run.taken(rows.pose))
         body = _stacked(run, rows, found, "a window says nothing about the body of its bird")
     elif configs[0].error_bars:
         covariance, used = None, stage
@@ -182,15 +176,21 @@ class _StageRun(NamedTuple):
     count: int
     """Number of problems."""
 
+    def taken(self, rows: Any) -> list[Any]:
+        """Return the rows of each tile, of a pytree of arrays with one row for each problem."""
+        return [take_tile(rows, tile) for _, tile in self.tiles]
+
     def of_tiles(self, function: Callable[..., A], *others: Sequence[Any]) -> list[A]:
-        """Return a function of the problems, the positions and one item of each of `others` of every tile.
+        """Return a function of the program, the problems and one item of each of `others` of every tile.
 
         Threads compute some tiles at the same time, because not all steps of a computation use several cores.
         """
-        items = zip(*zip(*self.tiles, strict=True), *others, strict=True)
-        return list(
-            in_threads(lambda item: jax.block_until_ready(function(*item)), items, min(usable_cores(), TILES_AT_ONCE))
-        )
+
+        def of_tile(arguments: tuple[Any, ...]) -> A:
+            return jax.block_until_ready(function(self.program, *arguments))
+
+        problems = [p for p, _ in self.tiles]
+        return list(in_threads(of_tile, zip(problems, *others, strict=True), min(usable_cores(), TILES_AT_ONCE)))
 
     def joined(self, parts: Iterable[Any]) -> Any:
         """Return the results of all tiles as NumPy arrays, one row for each problem."""
@@ -234,13 +234,13 @@ def _take_steps(run: _StageRun, rows: Hypotheses, carries: bool, report_progress
     """
     stage, program = run.stage, run.program
     carried = rows.solver if stage.carry_moments else None
-    states = [begin(program, p, take_tile(carried, tile)) for p, tile in run.tiles]
+    states = [begin(program, p, own) for (p, _), own in zip(run.tiles, run.taken(carried), strict=True)]
     done, chunk, rejected = 0, 1, []
     while done < stage.steps:
         take = min(chunk, stage.steps - done)
         start = time.perf_counter()
         steps = jnp.int32(take)
-        advanced = run.of_tiles(lambda p, _, state, steps=steps: advance((program, p, steps), state), states)
+        advanced = run.of_tiles(lambda program, p, state, steps=steps: advance((program, p, steps), state), states)
         states, losses, rejected = (list(parts) for parts in zip(*advanced, strict=True))
         mean_loss = np.mean(run.joined(losses))  # waits for the result
         seconds = time.perf_counter() - start
@@ -274,11 +274,11 @@ def _error_bars(
 ) -> ErrorBars:
     """Return the error bars of all rows, and log why a row that did not diverge has none."""
 
-    def of_tile(p: Problem, tile: np.ndarray) -> tuple[list[ErrorBars], list[str]]:
-        of_bodies = None if body_covariance is None else take_tile(body_covariance, tile)
-        return window_error_bars(run.program, p, take_tile(rows.pose, tile), common_size, of_bodies)
+    def of_tile(program: Program, p: Problem, pose: Pose, of_bodies: Any) -> tuple[list[ErrorBars], list[str]]:
+        return window_error_bars(program, p, pose, common_size, of_bodies)
 
-    return _stacked(run, rows, run.of_tiles(of_tile), "a window has no error bars")
+    found = run.of_tiles(of_tile, run.taken(rows.pose), run.taken(body_covariance))
+    return _stacked(run, rows, found, "a window has no error bars")
 
 
 def _stacked(run: _StageRun, rows: Hypotheses, found: Sequence[tuple[Sequence[Any], Sequence[str]]], what: str) -> Any:

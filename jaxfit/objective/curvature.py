@@ -78,18 +78,18 @@ def pentadiagonal_solver(diagonal: Rows, bands: Float[Array, "2 T D"]) -> Callab
         diagonal: diagonal of P, positive.
         bands: entries of P one and two frames apart, as `Curvature.bands`.
     """
-    first, second = (jnp.concatenate([jnp.zeros_like(b[:k]), b[:-k]]) for k, b in ((1, bands[0]), (2, bands[1])))
+    to_1, to_2 = (jnp.concatenate([jnp.zeros_like(b[:k]), b[:-k]]) for k, b in ((1, bands[0]), (2, bands[1])))
     one = jnp.ones_like(diagonal[0])
 
     def factor(before: Any, row: Any) -> Any:
         pivot_1, pivot_2, lower_1 = before  # of the frame before, of two frames before
-        a, b, c = row
+        a, b, c = row  # the diagonal, and the entries one and two frames before
         second = c / pivot_2
         first = (b - second * pivot_2 * lower_1) / pivot_1
         pivot = jnp.maximum(a - first**2 * pivot_1 - second**2 * pivot_2, SMALLEST_PIVOT * a)
         return (pivot, pivot_1, first), (pivot, first, second)
 
-    _, (pivots, lower_1, lower_2) = jax.lax.scan(factor, (one, one, 0 * one), (diagonal, first, second))
+    _, (pivots, lower_1, lower_2) = jax.lax.scan(factor, (one, one, 0 * one), (diagonal, to_1, to_2))
 
     def substitute(before: Any, row: Any) -> Any:
         (x_1, x_2), (v, b, c) = before, row

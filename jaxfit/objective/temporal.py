@@ -128,7 +128,7 @@ def low_pass(
     cutoff_cycles_per_frame: Scalar | float = 0.15,
     beta_global: Scalar | float = 1.0,
     beta_pose: Scalar | float = 1.0,
-) -> tuple[Residuals, ...]:
+) -> tuple[Residuals, Residuals]:
     """Penalise the energy of motion above a cut-off frequency, rad².
 
     E = Σ_k w_k (β_g ‖ĝ_k‖² + β_p ‖θ̂_k‖²), where ĝ_k and θ̂_k are the coefficients of the orthonormal DCT-II over the

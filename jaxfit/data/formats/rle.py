@@ -26,6 +26,11 @@ class MaskRuns(NamedTuple):
     areas: Int[np.ndarray, "M"]
     """Number of pixels of each mask."""
 
+    @property
+    def starts(self) -> Int[np.ndarray, "M+1"]:
+        """First run of each mask, and the end of the last."""
+        return np.searchsorted(self.mask, np.arange(len(self.areas) + 1))
+
 
 def read_segmentation(segmentation: Any, height: int, width: int) -> dict[str, Any] | None:
     """Return the mask of a bird as compressed run lengths, which `first_invalid` still has to check.
