@@ -27,7 +27,7 @@ class MaskRuns(NamedTuple):
     """Number of pixels of each mask."""
 
     @property
-    def starts(self) -> Int[np.ndarray, "M+1"]:
+    def starts(self) -> Int[np.ndarray, "_"]:
         """First run of each mask, and the end of the last."""
         return np.searchsorted(self.mask, np.arange(len(self.areas) + 1))
 
