@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from jaxfit.foundation.errors import one_line
 from jaxfit.foundation.progress import Clock
 from jaxfit.foundation.threads import MAX_AT_ONCE, in_threads, usable_cores
 from jaxfit.foundation.unfinished import Parts
+from jaxfit.perception.carried_masks import BLOCK_FRAMES
 from jaxfit.perception.general_networks import DETECTORS
 from jaxfit.perception.keypoints import keypoint_file, load_keypoint_detector
 from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
@@ -128,6 +130,12 @@ class FrameDetections(NamedTuple):
     """The keypoints of all instances, because crops also hide birds without a track."""
     picture: UInt8[np.ndarray, "H W 3"] | None
     """None where another process has read the picture."""
+    ends_block: bool
+    """Whether the detections of the frames that follow do not depend on this frame or earlier frames."""
+
+
+BLOCKS_BYTES = 2**30
+"""Largest memory of the pictures of the blocks that are segmented at the same time."""
 
 
 def frames_at_once(config: TrackConfig) -> int:
@@ -140,16 +148,20 @@ def detect(
 ) -> Generator[FrameDetections | int]:
     """Yield the detections of every frame, by networks in this process; for a damaged frame, yield only its number.
 
-    Threads run the networks on the next frames.
+    Threads run the networks on the next frames. A segmenter with the method `block` segments blocks of
+    `BLOCK_FRAMES` frames; the first frame of the reader begins a block.
 
     Args:
         reader: the frames.
         segmenter, keypoints: the networks; several threads call them if `at_once` is above 1.
-        clock: measures the time until the detections of a frame are complete.
-        at_once: number of frames on which the networks run at the same time.
+        clock: measures the time until the detections of a frame or block are complete.
+        at_once: number of frames or blocks on which the networks run at the same time; fewer blocks of large frames.
     """
     for network in (segmenter, keypoints):
         take_distances(network)  # those of an earlier video
+    block = getattr(segmenter, "block", None)
+    if block:
+        at_once = max(1, min(at_once, BLOCKS_BYTES // (3 * BLOCK_FRAMES * int(np.prod(reader.info.size_px)))))
 
     def items() -> Generator[Frame | int]:
         seen = 0
@@ -159,18 +171,26 @@ def detect(
             yield frame
         yield from reader.damaged[seen:]
 
-    def detected(item: Frame | int) -> FrameDetections | int:
-        if isinstance(item, int):
-            return item
-        number, picture, time_s = item
-        instances = segmenter(picture)
+    def blocks() -> Generator[list[Frame | int]]:
+        remaining = items()
+        while group := list(islice(remaining, BLOCK_FRAMES if block else 1)):
+            yield group
+
+    def detected(group: list[Frame | int]) -> list[FrameDetections | int]:
+        pictures = [item.picture for item in group if isinstance(item, Frame)]
+        segmented = iter(block(pictures) if block else map(segmenter, pictures))
+        return [item if isinstance(item, int) else of_frame(item, next(segmented), item is group[-1]) for item in group]
+
+    def of_frame(frame: Frame, instances: list[Instance], ends_block: bool) -> FrameDetections:
+        number, picture, time_s = frame
         distance = take_distances(segmenter)
         of_birds = FrameKeypoints(*keypoints(picture, instances), take_distances(keypoints))
         size_px = (picture.shape[1], picture.shape[0])
-        return FrameDetections(number, time_s, size_px, instances, distance, of_birds, picture)
+        return FrameDetections(number, time_s, size_px, instances, distance, of_birds, picture, ends_block)
 
-    with single_opencv_thread(), closing(in_threads(detected, items(), at_once)) as results:
-        yield from clock.each("detect", results)
+    with single_opencv_thread(), closing(in_threads(detected, blocks(), at_once)) as results:
+        for group in clock.each("detect", results):
+            yield from group
 
 
 def take_distances(network: object) -> np.ndarray:
@@ -191,7 +211,7 @@ def single_opencv_thread() -> Iterator[None]:
 
 
 FRAMES_PER_PART = 50
-"""Frames between two writes. An interruption costs at most the work on so many frames."""
+"""Frames between two writes, and those to the end of their block: what an interruption costs at most."""
 
 _LAYOUT = {  # F frames, M instances, m of them with a track
     "frame_index": "F",
@@ -392,7 +412,8 @@ def tracked_frames(
                 )
                 unstored.append(frame)
                 has_frames = True
-                if parts is not None and sum(isinstance(item, RecordedFrame) for item in unstored) == FRAMES_PER_PART:
+                num_unstored = sum(isinstance(item, RecordedFrame) for item in unstored)
+                if parts is not None and num_unstored >= FRAMES_PER_PART and detected.ends_block:
                     _store(parts, unstored, num_keypoints, is_last=False)
                     unstored = []
             yield frame

@@ -48,8 +48,8 @@ def replace_parts(
 
 def common_pixels(first: Instance, second: Instance) -> int:
     """Count the pixels that belong to both birds."""
-    corners = [(i.x0, i.y0, i.x0 + i.mask.shape[1], i.y0 + i.mask.shape[0]) for i in (first, second)]
-    (x0, y0), (x1, y1) = np.max(corners, 0)[:2].tolist(), np.min(corners, 0)[2:].tolist()
+    corners = np.array([first.corners_px, second.corners_px]).astype(int)
+    (x0, y0), (x1, y1) = corners.max(0)[:2].tolist(), corners.min(0)[2:].tolist()
     if x0 >= x1 or y0 >= y1:
         return 0
     parts = [i.mask[y0 - i.y0 : y1 - i.y0, x0 - i.x0 : x1 - i.x0] for i in (first, second)]
@@ -60,6 +60,11 @@ def mask_iou(first: Instance, second: Instance) -> float:
     """Return the intersection over union of the masks of two birds."""
     common = common_pixels(first, second)
     return common / (np.count_nonzero(first.mask) + np.count_nonzero(second.mask) - common)
+
+
+def smaller_inside(first: Instance, second: Instance) -> float:
+    """Return the share of the smaller of two birds that lies in the other."""
+    return common_pixels(first, second) / min(np.count_nonzero(first.mask), np.count_nonzero(second.mask))
 
 
 MIN_TILE_SHARE = 0.5  # of the smaller mask within the intersection of two tiles

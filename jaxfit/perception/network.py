@@ -50,6 +50,12 @@ class Instance(NamedTuple):
         height, width = self.mask.shape
         return np.array([self.x0, self.y0, width, height], np.float32)
 
+    @property
+    def corners_px(self) -> Float[np.ndarray, "4"]:
+        """The tight box of the mask: x0, y0, x1, y1; image pixels."""
+        height, width = self.mask.shape
+        return np.array([self.x0, self.y0, self.x0 + width, self.y0 + height], np.float32)
+
     def whole(self, size_px: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
         """Return the mask over a frame of the given width and height."""
         mask = np.zeros(size_px[::-1], bool)
@@ -81,7 +87,11 @@ def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int
 
 @runtime_checkable
 class Segmenter(Protocol):
-    """Detects the instances of a frame."""
+    """Detects the instances of a frame.
+
+    A method `block` replaces the call where frames follow each other: it takes at most
+    `jaxfit.perception.carried_masks.BLOCK_FRAMES` frames, and returns the instances of each.
+    """
 
     class_names: tuple[str, ...]
     """The classes that the segmenter reports."""

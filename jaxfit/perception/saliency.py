@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.data.masks import box_iou
-from jaxfit.perception.merging import common_pixels, mask_iou, tile_spans
+from jaxfit.perception.carried_masks import segment_block
+from jaxfit.perception.merging import common_pixels, mask_iou, smaller_inside, tile_spans
 from jaxfit.perception.network import Instance, OnnxModel, instance_of, normalise
 from jaxfit.perception.segmentation_inputs import Placement, image_input
 from jaxfit.perception.segmentation_layouts import Detection, View, Yolox
@@ -109,25 +110,34 @@ class DetectorAndSaliency:
         self.min_best_score = min_score
         """A track of doubtful detections alone does not count."""
 
-    def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
-        """Segment a frame, as `Segmenter` describes; without a certain bird, at a second size too."""
+    def __call__(self, frame: UInt8[np.ndarray, "H W 3"], known: Sequence[Instance] = ()) -> list[Instance]:
+        """Segment a frame, as `Segmenter` describes; without a certain bird, at a second size too.
+
+        Birds that are known in this frame are not segmented, and not returned.
+        """
         zooms, found = ZOOMS[:1], self._detector(frame)
         if not any(map(self._is_certain, found)):
             zooms, found = ZOOMS, self._detector(frame, *map(View, ZOOMS))
         certain = [one for one in found if self._is_certain(one)]
-        birds: list[Instance] = []
-        for one in certain:
-            segmented = self._segmented(frame, one, certain)
+        boxes = [Detection(bird.corners_px, bird.score, bird.label) for bird in known]
+        birds = list(known)
+        for one, iou in zip(certain, _box_iou(certain, boxes), strict=True):
+            segmented = self._segmented(frame, one, certain) if iou.max(initial=0) <= MIN_SAME_IOU else None
             if segmented and all(mask_iou(segmented.bird, bird) <= MIN_SAME_IOU for bird in birds):
                 birds.append(segmented.bird)
         # the mirror image is tested before the masks, because the detector is much faster than the saliency network
-        doubtful = [one for one in found if not self._is_certain(one) and not _overlap(one, certain)][:MAX_DOUBTFUL]
+        others = [*certain, *boxes]
+        doubtful = [one for one in found if not self._is_certain(one) and not _overlap(one, others)][:MAX_DOUBTFUL]
         mirrored = self._detector(frame, *(View(zoom, mirrored=True) for zoom in zooms)) if doubtful else []
         for one, iou in zip(doubtful, _box_iou(doubtful, mirrored), strict=True):
             segmented = self._segmented(frame, one, certain) if iou.max(initial=0) > MIN_SAME_IOU else None
             if segmented and not _is_known(segmented.bird, birds) and self._is_confirmed(frame, segmented):
                 birds.append(segmented.bird)
-        return birds
+        return birds[len(known) :]
+
+    def block(self, frames: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[list[Instance]]:
+        """Segment consecutive frames, most of them by optical flow (`jaxfit.perception.carried_masks`)."""
+        return segment_block(self, frames)
 
     def photograph(self, picture: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
         """Segment a photograph, more thoroughly than a frame of a film; the result is as that of a call.
@@ -206,7 +216,7 @@ class DetectorAndSaliency:
             bird = instance_of(mask, detection.score, detection.label, salient.x0, salient.y0)
             if bird is None or np.count_nonzero(mask & own) < MIN_INSIDE * np.count_nonzero(mask):
                 break
-            box_px = np.array([bird.x0, bird.y0, bird.x0 + bird.mask.shape[1], bird.y0 + bird.mask.shape[0]])
+            box_px = bird.corners_px.astype(int)
             # a mask may end at the border of the frame
             if not ((box_px == crop_px) & (crop_px != [0, 0, *frame_px])).any():
                 has_one_part = bool(np.count_nonzero(mask) >= MIN_PART * np.count_nonzero(free))
@@ -288,7 +298,7 @@ class DetectorAndSaliency:
 
 def _is_known(bird: Instance, birds: Sequence[Instance]) -> bool:
     """Whether the larger part of the smaller of two birds is the same bird."""
-    return any(max(_share(bird, other), _share(other, bird)) >= MIN_INSIDE for other in birds)
+    return any(smaller_inside(bird, other) >= MIN_INSIDE for other in birds)
 
 
 def _share(bird: Instance, other: Instance) -> float:

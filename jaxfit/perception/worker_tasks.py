@@ -16,6 +16,7 @@ from jaxfit.config.perception import BUILTIN, OUTLINE, FramesConfig, TrackConfig
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import Clock
 from jaxfit.foundation.workers import Cluster, FailedTask
+from jaxfit.perception.carried_masks import BLOCK_FRAMES
 from jaxfit.perception.detections import (
     FrameDetections,
     detect,
@@ -28,8 +29,8 @@ from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import read_frames, warn_of_damage
 
-FRAMES_PER_TASK = 25
-"""Frames of a task. A task begins with a jump into the video, which decodes from the keyframe before."""
+FRAMES_PER_TASK = 2 * BLOCK_FRAMES
+"""Frames of a task, whole blocks. A task begins with a jump into the video, which decodes from the keyframe before."""
 
 _logger = logging.getLogger(__name__)
 

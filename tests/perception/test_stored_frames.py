@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from support.toy_footage import FRAMES, MISSED, Footage, MonitoredSegmenter, TrueKeypoints, assert_same_tracking
+from support.toy_footage import (
+    FRAMES,
+    MISSED,
+    BlockSegmenter,
+    Footage,
+    MonitoredSegmenter,
+    TrueKeypoints,
+    assert_same_tracking,
+)
 
 from jaxfit.config.perception import FramesConfig, TrackConfig, TrackerConfig
 from jaxfit.foundation.errors import InputError
@@ -65,6 +73,26 @@ def test_a_tracking_that_stops_at_every_frame(video, tmp_path, frames):
     again, done = run(video, Parts(tmp_path / "p", {}), frames=frames)
     assert done == []
     assert_same_tracking(again, whole)
+
+
+@pytest.mark.parametrize("frames", [FramesConfig(), FramesConfig(1, 9, 1), FramesConfig(0, None, 2)])
+def test_parts_end_with_blocks_so_a_tracking_that_continues_has_the_same_blocks(video, tmp_path, monkeypatch, frames):
+    monkeypatch.setattr(detections, "BLOCK_FRAMES", 3)
+    config = TrackConfig(min_track_frames=2, frames=frames)
+
+    def track(parts=None):
+        segmenter = BlockSegmenter(FOOTAGE)
+        return run_tracking(video, config, segmenter, TrueKeypoints(FOOTAGE), parts=parts), segmenter.frames
+
+    whole, seen = track(Parts(tmp_path / "p", {}))
+    assert len(set(np.asarray(whole.observations.score)[whole.observations.present])) == 3
+    numbers = Parts(tmp_path / "p", {}).numbers
+    for kept in numbers:
+        parts = Parts(tmp_path / "p", {})
+        parts.keep(kept)
+        resumed, seen_again = track(parts)
+        assert_same_tracking(resumed, whole)
+        assert len(seen_again) < len(seen) or kept == 0
 
 
 def test_a_missing_part_and_a_damaged_part(video, tmp_path):

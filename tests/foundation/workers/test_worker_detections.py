@@ -10,6 +10,7 @@ from support.toy_footage import (
     BIRD,
     FRAMES,
     MISSED,
+    BlockSegmenter,
     Footage,
     MonitoredKeypoints,
     MonitoredSegmenter,
@@ -68,6 +69,14 @@ def test_tracks_are_those_of_one_process(video, workers, frames, tmp_path):
         one, other = np.load(file), np.load(stored[1] / file.name)
         for name in one.files:
             np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_tasks_hold_whole_blocks(video, workers, monkeypatch):
+    monkeypatch.setattr(detections, "BLOCK_FRAMES", 3)
+    monkeypatch.setattr(worker_tasks, "FRAMES_PER_TASK", 6)
+    monkeypatch.setattr(worker_tasks, "open_segmenter", lambda _: BlockSegmenter(FOOTAGE))
+    alone = run_tracking(video, CONFIG, BlockSegmenter(FOOTAGE), networks()[1])
+    assert_same_tracking(run_tracking(video, CONFIG, BlockSegmenter(FOOTAGE), networks()[1], cluster=workers), alone)
 
 
 def test_an_interrupted_tracking_continues(video, workers, tmp_path):

@@ -1,0 +1,209 @@
+"""Masks of consecutive frames from a few key frames, which a slow segmenter segments.
+
+Optical flow carries each bird of the key frames to the other frames. Masks of different key frames that overlap there
+are votes for one bird. Where votes of earlier and later key frames agree, the mask has the pixels of most votes, so an
+error of the segmenter in one key frame stays there, and a bird that it misses there is not lost. Where they do not
+agree, or a bird has a single vote, the flow or the segmenter is wrong, or the bird came or left: of these frames, the
+one farthest from all key frames becomes a key frame too. So birds that flow cannot follow are segmented in every frame.
+
+The flow of a bird is computed in a crop around it at a size of its own, so large and small birds have equal errors.
+
+Source: Kroeger et al. 2016, *Fast Optical Flow using Dense Inverse Search*; the votes are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxfit.perception.merging import mask_iou, smaller_inside
+from jaxfit.perception.network import Instance, instance_of
+from jaxfit.perception.segmentation_inputs import Placement
+
+BLOCK_FRAMES = 15
+"""Frames that share key frames. In longer blocks, the flow would need as much time as the segmenter."""
+VOTES = 3
+"""Number of key frames of a block at first, and of votes that count: the least of which most can agree."""
+AGREED_IOU = 0.85
+"""Votes with a larger IoU agree: as much as the masks that several people draw, 0.85 to 0.91 (Kirillov et al. 2023)."""
+MIN_INSIDE = 0.5
+"""Votes are for the same bird if a larger share of the smaller mask lies in the other."""
+MARGIN = 0.5
+"""Margin on each side of the crop around a bird, as a share of the sides of its box."""
+CROP_PX = 480
+"""Longer side of a crop. The flow has a vector for every fourth pixel."""
+_LEAST_PX = 64  # of the shorter side of a crop, because the flow is computed in patches
+
+
+_Source = tuple[int, int]
+"""Key frame and number of a bird that the segmenter saw."""
+
+
+class _Vote(NamedTuple):
+    """A bird of a key frame, carried to another frame."""
+
+    source: _Source
+    mask: Instance
+
+    @property
+    def key(self) -> int:
+        return self.source[0]
+
+
+class _Count(NamedTuple):
+    """The result of the votes in a frame."""
+
+    birds: list[Instance]
+    sources: list[set[_Source]]
+    """Whose votes are at the place of each bird."""
+    agreed: list[set[_Source]]
+    """Whose votes agree with the mask of each bird."""
+    rest: list[set[_Source]]
+    """Whose votes do not agree, for each place."""
+
+
+def segment_block(
+    segment: Callable[[np.ndarray, Sequence[Instance]], list[Instance]], frames: Sequence[UInt8[np.ndarray, "H W 3"]]
+) -> list[list[Instance]]:
+    """Segment consecutive frames of a film.
+
+    Args:
+        segment: returns the birds of a frame beside those that are known in this frame.
+        frames: at most `BLOCK_FRAMES` frames of the same size; blue, green, red.
+
+    Returns:
+        The birds of each frame, by falling score.
+    """
+    greys = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
+    count = len(frames)
+    votes: list[list[_Vote]] = [[] for _ in frames]
+    added = sorted({(2 * part + 1) * count // (2 * VOTES) for part in range(VOTES)})  # the middles of equal parts
+    known = dict.fromkeys(added, _Count([], [], [], []))  # key frame → result of the votes before
+    while True:
+        for key in added:
+            for number, bird in enumerate(segment(frames[key], known[key].birds)):
+                for n in range(count):
+                    mask = bird if n == key else _carry(bird, greys[key], greys[n])
+                    if mask is not None:
+                        votes[n].append(_Vote((key, number), mask))
+        counts, is_open = _counts(votes, known)
+        open_frames = [n for n in range(count) if is_open[n] and n not in known]
+        if not open_frames:
+            return [sorted(of_frame.birds, key=lambda bird: -bird.score) for of_frame in counts]
+        added = [max(open_frames, key=lambda n: min(abs(n - key) for key in known))]
+        known |= {key: counts[key] for key in added}
+
+
+def _counts(votes: Sequence[Sequence[_Vote]], known: Mapping[int, _Count]) -> tuple[list[_Count], list[bool]]:
+    """Count the votes of all frames. A bird is not carried beyond a key frame in which it is not.
+
+    Args:
+        votes: the votes in each frame.
+        known: key frame → birds that the segmenter was not asked for.
+
+    Returns:
+        The results, and whether the votes of a frame leave a bird open: they do not agree, and the bird is none of
+        those that are agreed there.
+    """
+    at_keys = {key: _count(key, votes[key], known) for key in known}
+    together = [sources for count in at_keys.values() for sources in count.agreed]
+
+    def reaches(vote: _Vote, n: int) -> bool:
+        between = (key for key in known if min(vote.key, n) < key < max(vote.key, n))
+        return all(any(vote.source in sources for sources in at_keys[key].sources) for key in between)
+
+    counts = list[_Count]()
+    for n, of_frame in enumerate(votes):
+        if n in at_keys:
+            counts.append(at_keys[n])
+            continue
+        counts.append(_count(n, [vote for vote in of_frame if reaches(vote, n)], known))
+        if n < min(known) or n > max(known):  # the segmenter may have missed the bird in the first or last key frame
+            counts[n].rest.extend({vote.source} for vote in of_frame if not reaches(vote, n))
+
+    def is_counted(rest: set[_Source], count: _Count) -> bool:
+        same = rest.union(*(sources for sources in together if sources & rest))
+        return any(sources & same for sources in count.agreed)
+
+    return counts, [not all(is_counted(rest, count) for rest in count.rest) for count in counts]
+
+
+def _count(n: int, votes: Sequence[_Vote], known: Mapping[int, _Count]) -> _Count:
+    """Count the votes of a frame. A bird is in this key frame, or needs agreeing votes from before and after.
+
+    Where the nearest key frame of a side has no vote, because there is none or because the segmenter was not asked for
+    the bird, the agreeing votes may come from the other side.
+    """
+    groups: list[list[_Vote]] = []
+    for vote in sorted(votes, key=lambda vote: abs(vote.key - n)):
+        same = [max(smaller_inside(vote.mask, other.mask) for other in group) for group in groups]
+        if max(same, default=0) > MIN_INSIDE:
+            groups[int(np.argmax(same))].append(vote)
+        else:
+            groups.append([vote])
+    around = (
+        [n] if n in known else [max(filter(n.__gt__, known), default=None), min(filter(n.__lt__, known), default=None)]
+    )
+    result = _Count([], [], [], [])
+    for group in groups:
+        sources = {vote.source for vote in group}
+        from_one_side = any(key is None or any(sources & one for one in known[key].sources) for key in around)
+        agreed = [
+            vote.mask
+            for vote in group
+            if any(
+                other is not vote
+                and (from_one_side or (vote.key < n) != (other.key < n))
+                and mask_iou(vote.mask, other.mask) > AGREED_IOU
+                for other in group
+            )
+        ]
+        if group[0].key != n and not agreed:
+            result.rest.append(sources)
+            continue
+        bird = group[0].mask if group[0].key == n else _majority(agreed[:VOTES])
+        result.birds.append(bird)
+        result.sources.append(sources)
+        result.agreed.append({vote.source for vote in group if mask_iou(vote.mask, bird) > AGREED_IOU})
+    return result
+
+
+def _majority(masks: Sequence[Instance]) -> Instance:
+    """Return the mask of the pixels of most masks, with the score of the first; of two masks, the first."""
+    first = masks[0]
+    if len(masks) == 2:
+        return first
+    corners = np.array([mask.corners_px for mask in masks]).astype(int)
+    (x0, y0), (x1, y1) = corners.min(0)[:2].tolist(), corners.max(0)[2:].tolist()
+    count = np.zeros((y1 - y0, x1 - x0), np.uint8)
+    for mask in masks:
+        height, width = mask.mask.shape
+        count[mask.y0 - y0 :, mask.x0 - x0 :][:height, :width] += mask.mask
+    return instance_of(2 * count > len(masks), first.score, first.label, x0, y0) or first
+
+
+def _carry(bird: Instance, grey: UInt8[np.ndarray, "H W"], other: UInt8[np.ndarray, "H W"]) -> Instance | None:
+    """Return the bird of a frame in another frame, by the flow between the frames around it; None if it left."""
+    height, width = bird.mask.shape
+    low = np.floor(np.array([bird.x0 - MARGIN * width, bird.y0 - MARGIN * height])).astype(int)
+    high = np.ceil(np.array([bird.x0 + (1 + MARGIN) * width, bird.y0 + (1 + MARGIN) * height])).astype(int)
+    (x0, y0), (x1, y1) = np.maximum(low, 0).tolist(), np.minimum(high, grey.shape[::-1]).tolist()
+    zoom = CROP_PX / max(x1 - x0, y1 - y0)
+    size = (max(round((x1 - x0) * zoom), _LEAST_PX), max(round((y1 - y0) * zoom), _LEAST_PX))
+    mask = np.zeros((y1 - y0, x1 - x0), np.float32)
+    mask[bird.y0 - y0 :, bird.x0 - x0 :][:height, :width] = bird.mask
+    method = cv2.INTER_AREA if zoom < 1 else cv2.INTER_LINEAR
+    here, there, mask = (
+        cv2.resize(x, size, interpolation=method) for x in (grey[y0:y1, x0:x1], other[y0:y1, x0:x1], mask)
+    )
+    method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow = method.calc(there, here, None)
+    columns, rows = np.meshgrid(np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32))
+    moved = cv2.remap(mask, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
+    crop_px = np.array([x0, y0, x1, y1])
+    placement = Placement.cropped((grey.shape[1], grey.shape[0]), size, crop_px)
+    return placement.instance(moved, crop_px.astype(np.float32), 0.5, bird.score, bird.label)
