@@ -22,7 +22,6 @@ from jaxtyping import UInt8
 
 from jaxfit.perception.merging import mask_iou, smaller_inside
 from jaxfit.perception.network import Instance, instance_of
-from jaxfit.perception.segmentation_inputs import Placement
 
 BLOCK_FRAMES = 15
 """Frames that share key frames. In longer blocks, the flow would need as much time as the segmenter."""
@@ -86,8 +85,7 @@ def segment_block(
     while True:
         for key in added:
             for number, bird in enumerate(segment(frames[key], known[key].birds)):
-                for n in range(count):
-                    mask = bird if n == key else _carry(bird, greys[key], greys[n])
+                for n, mask in enumerate(_carried(bird, key, greys)):
                     if mask is not None:
                         votes[n].append(_Vote((key, number), mask))
         counts, is_open = _counts(votes, known)
@@ -186,24 +184,32 @@ def _majority(masks: Sequence[Instance]) -> Instance:
     return instance_of(2 * count > len(masks), first.score, first.label, x0, y0) or first
 
 
-def _carry(bird: Instance, grey: UInt8[np.ndarray, "H W"], other: UInt8[np.ndarray, "H W"]) -> Instance | None:
-    """Return the bird of a frame in another frame, by the flow between the frames around it; None if it left."""
+def _carried(bird: Instance, key: int, greys: Sequence[UInt8[np.ndarray, "H W"]]) -> list[Instance | None]:
+    """Return the bird of a key frame in every frame, by the flow between the frames around it; None where it left."""
     height, width = bird.mask.shape
     low = np.floor(np.array([bird.x0 - MARGIN * width, bird.y0 - MARGIN * height])).astype(int)
     high = np.ceil(np.array([bird.x0 + (1 + MARGIN) * width, bird.y0 + (1 + MARGIN) * height])).astype(int)
-    (x0, y0), (x1, y1) = np.maximum(low, 0).tolist(), np.minimum(high, grey.shape[::-1]).tolist()
-    zoom = CROP_PX / max(x1 - x0, y1 - y0)
-    size = (max(round((x1 - x0) * zoom), _LEAST_PX), max(round((y1 - y0) * zoom), _LEAST_PX))
-    mask = np.zeros((y1 - y0, x1 - x0), np.float32)
-    mask[bird.y0 - y0 :, bird.x0 - x0 :][:height, :width] = bird.mask
-    method = cv2.INTER_AREA if zoom < 1 else cv2.INTER_LINEAR
-    here, there, mask = (
-        cv2.resize(x, size, interpolation=method) for x in (grey[y0:y1, x0:x1], other[y0:y1, x0:x1], mask)
-    )
+    (x0, y0), (x1, y1) = np.maximum(low, 0).tolist(), np.minimum(high, greys[key].shape[::-1]).tolist()
+    crop_px = (x1 - x0, y1 - y0)
+    zoom = CROP_PX / max(crop_px)
+    size_px = [max(round(side * zoom), _LEAST_PX) for side in crop_px]
+    resizing, back = (cv2.INTER_AREA, cv2.INTER_LINEAR) if zoom < 1 else (cv2.INTER_LINEAR, cv2.INTER_AREA)
+
+    def crop(picture: np.ndarray) -> np.ndarray:
+        return cv2.resize(picture[y0:y1, x0:x1], size_px, interpolation=resizing)
+
+    padded = np.zeros(crop_px[::-1], np.float32)
+    padded[bird.y0 - y0 :, bird.x0 - x0 :][:height, :width] = bird.mask
+    mask, here = cv2.resize(padded, size_px, interpolation=resizing), crop(greys[key])
+    columns, rows = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in size_px))
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    flow = method.calc(there, here, None)
-    columns, rows = np.meshgrid(np.arange(size[0], dtype=np.float32), np.arange(size[1], dtype=np.float32))
-    moved = cv2.remap(mask, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
-    crop_px = np.array([x0, y0, x1, y1])
-    placement = Placement.cropped((grey.shape[1], grey.shape[0]), size, crop_px)
-    return placement.instance(moved, crop_px.astype(np.float32), 0.5, bird.score, bird.label)
+    found: list[Instance | None] = []
+    for n, grey in enumerate(greys):
+        if n == key:
+            found.append(bird)
+            continue
+        flow = method.calc(crop(grey), here, None)
+        moved = cv2.remap(mask, columns + flow[..., 0], rows + flow[..., 1], cv2.INTER_LINEAR)
+        moved = cv2.resize(moved, crop_px, interpolation=back)
+        found.append(instance_of(moved > 0.5, bird.score, bird.label, x0, y0))
+    return found
