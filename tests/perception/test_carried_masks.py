@@ -129,3 +129,14 @@ def test_no_bird_and_a_bird_at_the_border():
     assert Scene([[]] * BLOCK_FRAMES).segment() == [[]] * BLOCK_FRAMES
     scene = Scene([[place] for place in walk((0, 190), (2, 0))])
     assert_masks(scene.segment(), scene, 0.85)
+
+
+@pytest.mark.parametrize("size_px", [(24, 16), (2000, 40), (16, 900)])
+@pytest.mark.parametrize("bird_px", [(1, 1), (3, 14), (12, 2)])
+def test_birds_of_few_pixels_and_narrow_frames(size_px, bird_px):
+    """Nothing moves, so the masks stay."""
+    width, height = size_px
+    frames = [np.repeat(cv2.resize(BACKGROUND, (width, height))[..., None], 3, -1)] * BLOCK_FRAMES
+    bird = instance_of(np.ones(bird_px[::-1], bool), 0.9, "bird", 1, 1)
+    for (found,) in segment_block(lambda frame, known: [] if known else [bird], frames):
+        assert mask_iou(found, bird) > 0.9
