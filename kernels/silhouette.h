@@ -28,13 +28,14 @@ struct Target {
 };
 
 // A mesh posed by linear blend skinning: vertex v lies at Σ_m weight[v, m] · B[joint[v, m]] · (rest[v], 1) in the camera
-// frame, where B (J, 3, 4) depends on P parameters. S further parameters move each vertex in its own way. D = P + S.
+// frame, where B (J, 3, 4) depends on P parameters. S further parameters move the vertices at rest. D = P + S.
 struct Skin {
   const float* rest;      // (V, 3)
   const int32_t* joint;   // (V, M)
   const float* weight;    // (V, M); entries of weight 0 are skipped
   const float* slope;     // (J, 3, 4, P): derivatives of B
-  const float* shape;     // (V, 3, S): derivatives of the vertices
+  const float* linear;    // (J, 3, 3): B without its last column
+  const float* shape;     // (V, 3, S): derivatives of the vertices at rest
   int64_t per_vertex;     // M
   int64_t transforming;   // P, a multiple of 16
   int64_t parameters;     // D, a multiple of 16

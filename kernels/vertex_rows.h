@@ -14,7 +14,7 @@ struct VertexRows {
 
 // Returns d vertex / d parameters in px: D derivatives of x, then D of y. Computes them where they are not ready.
 [[gnu::always_inline]] inline const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, const VertexRows& rows) {
-  const int64_t D = skin.parameters, P = skin.transforming;
+  const int64_t D = skin.parameters, P = skin.transforming, S = D - P;
   float* out = rows.values + 2 * v * D;
   if (rows.ready[v]) return out;
   rows.ready[v] = 1;
@@ -22,6 +22,11 @@ struct VertexRows {
   const float* rest = skin.rest + 3 * v;
   const float zoom = skin.focal / at[2];
   const float by_depth[2] = {(skin.centre - at[0]) / at[2], (skin.centre - at[1]) / at[2]};
+  float linear[9] = {};  // of the vertex: moves a displacement at rest to the camera frame
+  for (int64_t m = 0; S && m < skin.per_vertex; ++m) {
+    const int64_t entry = v * skin.per_vertex + m;
+    for (int k = 0; k < 9; ++k) linear[k] += skin.weight[entry] * skin.linear[9 * skin.joint[entry] + k];
+  }
   for (int64_t d = 0; d < D; d += kWidth) {
     Vec x[3] = {all(0.f), all(0.f), all(0.f)};  // d position / d parameters, camera frame
     for (int64_t m = 0; d < P && m < skin.per_vertex; ++m) {
@@ -31,7 +36,10 @@ struct VertexRows {
       for (int i = 0; i < 3; ++i, slope += 4 * P)
         for (int c = 0; c < 4; ++c) x[i] = fma(all(c < 3 ? w * rest[c] : w), load(slope + c * P), x[i]);
     }
-    for (int i = 0; d >= P && i < 3; ++i) x[i] = load(skin.shape + (3 * v + i) * (D - P) + d - P);
+    for (int c = 0; d >= P && c < 3; ++c) {
+      const Vec moved = load(skin.shape + (3 * v + c) * S + d - P);
+      for (int i = 0; i < 3; ++i) x[i] = fma(all(linear[3 * i + c]), moved, x[i]);
+    }
     for (int i = 0; i < 2; ++i) store(out + i * D + d, fma(all(zoom), x[i], all(by_depth[i]) * x[2]));
   }
   return out;

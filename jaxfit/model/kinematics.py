@@ -386,18 +386,6 @@ def window_transform_derivatives(
     return each_frame(lambda frame, A: transform_derivatives(rig, A, frame, with_bones), pose, A)
 
 
-def shape_derivatives(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "V 3 S"]:
-    """Return the derivatives of the posed vertices of one frame with respect to the S coefficients that move the mesh,
-    camera frame, model units."""
-    turn = (A[..., :3].reshape(-1, 9).T @ rig.skin_weights).reshape(3, 3, -1)
-    return jnp.asarray(pose.scale) * jnp.einsum("dcv,scv->vds", turn, rig.shape_basis)
-
-
-def window_shape_derivatives(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T V 3 S"]:
-    """Return `shape_derivatives` of every frame of a window."""
-    return each_frame(lambda frame, A: shape_derivatives(rig, A, frame), pose, A)
-
-
 def _bone_vectors(rig: Rig, A: Float[Array, "J 3 4"]) -> Float[Array, "bones 3"]:
     """Return the bones of length 1 in the pose at scale 1, camera frame: the change of joint j and of its descendants
     per unit of length of the bone that ends at joint j."""

@@ -22,7 +22,6 @@ from jaxfit.model.kinematics import (
     window_keypoint_derivatives,
     window_keypoint_rows,
     window_keypoints,
-    window_shape_derivatives,
     window_transform_derivatives,
     window_transforms,
     window_vertices,
@@ -302,20 +301,19 @@ class PosedWindow:
     @cached_property
     def skin(self) -> Skin:
         """Derivatives of the vertices with respect to a row of `curvature.frame_rows`, in factors. Only `slope`
-        (I, J, 3, 4, D) and `shape_slope` (I, V, 3, S) have a leading axis of images. They are constants for JAX."""
+        (I, J, 3, 4, P) and `linear` (I, J, 3, 3) have a leading axis of images. They are constants for JAX."""
         pose, transforms = jax.lax.stop_gradient((self.pose, self._transforms))
         rest = shaped_vertices(self._rig, pose)
         slope = window_transform_derivatives(self._rig, transforms, pose, "bone_length" in self.shared)
-        shape_slope = jnp.zeros((*self.vertices_screen.shape, 0))
-        if "betas" in self.shared:
-            shape_slope = window_shape_derivatives(self._rig, transforms, pose)
+        linear = jnp.reshape(pose.scale, (-1, 1, 1, 1)) * transforms[..., :3]
+        shape_basis = self._rig.shape_basis.transpose(2, 1, 0)
+        if "betas" not in self.shared:
+            shape_basis = shape_basis[..., :0]
         views = self.targets.views
         if views is not None:
             slope = jnp.einsum("tvab,tjbcd->tvjacd", views.linear, slope).reshape(-1, *slope.shape[1:])
-            if shape_slope.shape[-1]:
-                shape_slope = jnp.einsum("tvab,tpbs->tvpas", views.linear, shape_slope)
-                shape_slope = shape_slope.reshape(-1, *shape_slope.shape[2:])
-        return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope, shape_slope)
+            linear = jnp.einsum("tvab,tjbc->tvjac", views.linear, linear).reshape(-1, *linear.shape[1:])
+        return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope, linear, shape_basis)
 
     @property
     def mask(self) -> UInt8[Array | np.ndarray, "I H W"]:

@@ -44,16 +44,16 @@ def _mask_and_blocks(window: PosedWindow, kind: Kind) -> tuple[Scalar, FrameBloc
     camera_px = window.camera.focal_px * ratio, window.camera.centre_px * ratio
     raster = {"kind": kind, "blur": window.raster.blur, "backend": window.raster.backend}
 
-    def frame(vertices_screen, target, weight, slope, shape_slope):
-        skin = window.skin._replace(slope=slope, shape_slope=shape_slope)
+    def frame(vertices_screen, target, weight, slope, linear):
+        skin = window.skin._replace(slope=slope, linear=linear)
         return mask_loss_and_block(vertices_screen, window.faces, target, weight, skin, camera_px, **raster)
 
-    skin = window.skin.slope, window.skin.shape_slope
+    skin = window.skin.slope, window.skin.linear
     values, blocks = jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window), *skin)
     if window.targets.views is not None:
         blocks = blocks.reshape(len(window.present), -1, *blocks.shape[1:]).sum(axis=1)
     if "betas" in window.shared:  # the last columns, of coefficients that move keypoints only
-        free = len(window.pose.betas) - window.skin.shape_slope.shape[-1]
+        free = len(window.pose.betas) - window.skin.shape_basis.shape[-1]
         blocks = jnp.pad(blocks, ((0, 0), (0, free), (0, free)))
     return jnp.sum(values), blocks
 

@@ -76,8 +76,10 @@ class Skin(NamedTuple):
     """Their skinning weights; 0 for entries that are not used."""
     slope: Float[Array, "J 3 4 P"]
     """Derivatives of B with respect to P parameters."""
-    shape_slope: Float[Array, "V 3 S"]
-    """Derivatives of the vertices with respect to S further parameters, which follow the P parameters; D = P + S."""
+    linear: Float[Array, "J 3 3"]
+    """B without its last column: how the joints turn and scale a displacement of the rest vertices."""
+    shape_basis: Float[Array, "V 3 S"]
+    """Derivatives of the rest vertices with respect to S parameters that follow the P parameters; D = P + S."""
 
 
 def _segment_distance_squared(x, y, a, b):
@@ -269,7 +271,8 @@ def silhouette_gauss_newton(
     vertices = jnp.where(missing, 1.0, vertices)
     rest = jnp.concatenate([skin.rest, jnp.ones_like(skin.rest[:, :1])], axis=1)
     by_transforms = jnp.einsum("vm,vmicd,vc->dvi", skin.weight, skin.slope[skin.joint], rest)
-    moved_cam = jnp.concatenate([by_transforms, jnp.moveaxis(skin.shape_slope, -1, 0)])  # (D, V, 3)
+    by_shape = jnp.einsum("vm,vmic,vcs->svi", skin.weight, skin.linear[skin.joint], skin.shape_basis)
+    moved_cam = jnp.concatenate([by_transforms, by_shape])  # (D, V, 3)
     depth = vertices[:, 2:]
     moved_px = (focal * moved_cam[..., :2] - (vertices[:, :2] - centre) * moved_cam[..., 2:]) / depth
     tangents = jnp.concatenate([moved_px, moved_cam[..., 2:]], axis=-1)

@@ -101,6 +101,7 @@ Results compute(const Case& own) {
                           joint.data(),
                           own.floats("skin_weight").data(),
                           own.floats("slope").data(),
+                          own.floats("linear").data(),
                           own.floats("shape").data(),
                           static_cast<int64_t>(joint.size()) / num_vertices,
                           static_cast<int64_t>(own.number("transforming")),

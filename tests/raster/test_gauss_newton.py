@@ -15,7 +15,6 @@ from jaxfit.model.kinematics import (
     fold_bird,
     joint_transforms,
     posed_vertices,
-    shape_derivatives,
     shaped_vertices,
     transform_derivatives,
 )
@@ -64,7 +63,8 @@ def posed(row):
     pose = pose_of(row)
     A, rest = joint_transforms(RIG, pose), shaped_vertices(RIG, pose).T
     slope = transform_derivatives(RIG, A, pose, with_bones=True)
-    return on_screen(row), Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope, shape_derivatives(RIG, A, pose))
+    of_shape = pose.scale * A[..., :3], RIG.shape_basis.transpose(2, 1, 0)
+    return on_screen(row), Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope, *of_shape)
 
 
 @functools.partial(jax.jit, static_argnames="blur")

@@ -94,7 +94,7 @@ HANDLERS = {
     "jaxfit_mask_loss": (("vertices", "faces", "target", "weight"), ("loss",)),
     "jaxfit_mask_loss_and_gradient": (("vertices", "faces", "target", "weight"), ("loss", "gradient")),
     "jaxfit_mask_loss_gradient_and_block": (
-        ("vertices", "faces", "mask", "weight", "rest", "joint", "skin_weight", "slope", "shape"),
+        ("vertices", "faces", "mask", "weight", "rest", "joint", "skin_weight", "slope", "linear", "shape"),
         ("loss", "gradient", "block"),
     ),
 }
@@ -113,7 +113,8 @@ SHAPES = {
     "joint": (1, V, 2),
     "skin_weight": (1, V, 2),
     "slope": (B, 2, 3, 4, 16),
-    "shape": (B, V, 3, 0),
+    "linear": (B, 2, 3, 3),
+    "shape": (1, V, 3, 0),
     "block": (B, 16, 16),
 }
 
@@ -160,6 +161,7 @@ def test_the_handlers_accept_shapes_that_fit():
         ("jaxfit_mask_loss_gradient_and_block", {"block": (B, 16, 32)}, r"block: .*\(2, 32, 32\), got \(2, 16, 32\)"),
         ("jaxfit_mask_loss_gradient_and_block", {"block": (B, 8, 8)}, "block: expected a multiple of 16 parameters"),
         ("jaxfit_mask_loss_gradient_and_block", {"rest": (B, 1, 3)}, r"rest: .*\(3, 3\), got \(2, 1, 3\)"),
+        ("jaxfit_mask_loss_gradient_and_block", {"linear": (B, 1, 3, 3)}, r"linear: .*\(2, 3, 3\), got \(2, 1, 3, 3\)"),
         ("jaxfit_mask_loss_gradient_and_block", {"slope": (B, 0, 3, 4, 16)}, r"joint: an index is not in \[0, 0\)"),
     ],
 )

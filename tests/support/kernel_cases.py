@@ -61,6 +61,7 @@ def _case(mesh, size: int, blur: reference.Blur, seed: int) -> dict[str, np.ndar
         jnp.asarray(rng.integers(0, JOINTS, (len(vertices), PER_VERTEX)), jnp.int32),
         jnp.asarray(rng.dirichlet(np.ones(PER_VERTEX), len(vertices)).round(2), jnp.float32),
         jnp.asarray(rng.normal(scale=0.1, size=(JOINTS, 3, 4, PARAMETERS)).round(2), jnp.float32),
+        jnp.asarray(rng.normal(size=(JOINTS, 3, 3)).round(1), jnp.float32),
         jnp.asarray(rng.normal(scale=0.1, size=(len(vertices), 3, SHAPES)).round(2), jnp.float32),
     )
     one = jnp.float32(1)
@@ -77,7 +78,8 @@ def _case(mesh, size: int, blur: reference.Blur, seed: int) -> dict[str, np.ndar
         "joint": skin.joint,
         "skin_weight": skin.weight,
         "slope": skin.slope,
-        "shape": skin.shape_slope,
+        "linear": skin.linear,
+        "shape": skin.shape_basis,
         "transforming": PARAMETERS,
         "parameters": PARAMETERS + SHAPES,
         "focal": FOCAL_PX,
