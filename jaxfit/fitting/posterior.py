@@ -362,6 +362,7 @@ def broad_precision(program: Program, pose: Pose, px_per_unit: float | None = No
         bone_length=np.full(np.shape(pose.bone_length), BROAD_BONE_SD),
         betas=np.full(np.shape(pose.betas), BROAD_SHAPE_SD),
     )
+    sd = jax.tree.map(np.float32, sd)
     return np.maximum(np.asarray(frame_rows(sd, program.shared), np.float64), 1e-6) ** -2
 
 

@@ -106,19 +106,20 @@ def pentadiagonal_solver(diagonal: Rows, bands: Float[Array, "2 T D"]) -> Callab
     return solve
 
 
-def frame_rows(pose: Pose, shared: Sequence[str] = ()) -> Rows:
+def frame_rows(pose: Pose, shared: Sequence[str] = ()) -> Rows | Float[np.ndarray, "T D"]:
     """Return the pose of a window as one row per frame, with the parameters `shared`.
 
     `shared` holds names of `SHARED_PARAMETERS`, in that order. A parameter that all frames share is repeated in every
-    row.
+    row. Rows of NumPy arrays are NumPy arrays: JAX would compile a program for every operation.
     """
+    xp: Any = np if isinstance(pose.transl, np.ndarray) else jnp
     frames = pose.global_orient.shape[0]
-    scale = jnp.broadcast_to(pose.scale, (frames,))
+    scale = xp.broadcast_to(pose.scale, (frames,))
     columns = [pose.global_orient, pose.body_pose.reshape(frames, -1), pose.transl, scale[:, None]]
     for name in shared:
-        values = jnp.asarray(getattr(pose, name))
-        columns.append(jnp.broadcast_to(values, (frames, values.shape[-1])))
-    return jnp.concatenate(columns, axis=1)
+        values = xp.asarray(getattr(pose, name))
+        columns.append(xp.broadcast_to(values, (frames, values.shape[-1])))
+    return xp.concatenate(columns, axis=1)
 
 
 def add_rows(pose: Pose, rows: Rows, shared: Sequence[str] = ()) -> Pose:
