@@ -178,7 +178,8 @@ def detect(
 
     def detected(group: list[Frame | int]) -> list[FrameDetections | int]:
         pictures = [item.picture for item in group if isinstance(item, Frame)]
-        segmented = iter(block(pictures) if block else map(segmenter, pictures))
+        # a block without a readable frame has no pictures
+        segmented = iter(block(pictures) if block and pictures else map(segmenter, pictures))
         return [item if isinstance(item, int) else of_frame(item, next(segmented), item is group[-1]) for item in group]
 
     def of_frame(frame: Frame, instances: list[Instance], ends_block: bool) -> FrameDetections:

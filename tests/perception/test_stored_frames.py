@@ -95,6 +95,21 @@ def test_parts_end_with_blocks_so_a_tracking_that_continues_has_the_same_blocks(
         assert len(seen_again) < len(seen) or kept == 0
 
 
+@pytest.mark.parametrize("block_frames", [1, 2])
+def test_a_block_of_damaged_frames_is_not_segmented(video, monkeypatch, block_frames):
+    monkeypatch.setattr(detections, "BLOCK_FRAMES", block_frames)
+    blocks = []
+
+    class Recording(BlockSegmenter):
+        def block(self, frames):
+            blocks.append(len(frames))
+            return super().block(frames)
+
+    result = run_tracking(video, TrackConfig(frames=FramesConfig(0, 7)), Recording(FOOTAGE), TrueKeypoints(FOOTAGE))
+    assert result.damaged_frames == [6]
+    assert blocks == [block_frames] * (6 // block_frames)
+
+
 def test_a_missing_part_and_a_damaged_part(video, tmp_path):
     whole, _ = run(video, Parts(tmp_path / "p", {}))
     file = tmp_path / "p" / "000001.npz"
