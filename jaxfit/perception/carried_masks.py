@@ -138,8 +138,8 @@ def _count(n: int, votes: Sequence[_Vote], known: Mapping[int, _Count]) -> _Coun
     """
     groups: list[list[_Vote]] = []
     for vote in sorted(votes, key=lambda vote: abs(vote.key - n)):
-        same = [max(smaller_inside(vote.mask, other.mask) for other in group) for group in groups]
-        if max(same, default=0) > MIN_INSIDE:
+        same = [_same_iou(vote, group) for group in groups]
+        if any(same):
             groups[int(np.argmax(same))].append(vote)
         else:
             groups.append([vote])
@@ -164,10 +164,23 @@ def _count(n: int, votes: Sequence[_Vote], known: Mapping[int, _Count]) -> _Coun
             result.rest.append(sources)
             continue
         bird = group[0].mask if group[0].key == n else _majority(agreed[:VOTES])
+        if any(mask_iou(bird, other) > MIN_INSIDE for other in result.birds):  # hidden behind the other bird
+            continue
         result.birds.append(bird)
         result.sources.append(sources)
         result.agreed.append({vote.source for vote in group if mask_iou(vote.mask, bird) > AGREED_IOU})
     return result
+
+
+def _same_iou(vote: _Vote, group: Sequence[_Vote]) -> float:
+    """Return the largest IoU with the votes of a group for the same bird; 0 if there are none.
+
+    Votes of one key frame are for different birds, because the segmenter separated them.
+    """
+    if any(other.key == vote.key for other in group):
+        return 0.0
+    same = (other.mask for other in group if smaller_inside(vote.mask, other.mask) > MIN_INSIDE)
+    return max((mask_iou(vote.mask, mask) for mask in same), default=0.0)
 
 
 def _majority(masks: Sequence[Instance]) -> Instance:

@@ -118,6 +118,18 @@ def test_a_bird_that_comes_and_a_bird_that_leaves():
     assert len(scene.calls) < BLOCK_FRAMES
 
 
+@pytest.mark.parametrize("num_frames", [1, BLOCK_FRAMES])
+def test_a_small_bird_inside_the_mask_of_a_large_bird_stays(num_frames):
+    frame = np.repeat(BACKGROUND[:HEIGHT, :WIDTH, None], 3, -1)
+    birds = [
+        instance_of(np.ones(size, bool), 0.9, "bird", x0, y0)
+        for size, x0, y0 in (((90, 140), 50, 40), ((40, 30), 90, 70))
+    ]
+    for found in segment_block(lambda frame, known: birds, [frame] * num_frames):
+        assert [max(mask_iou(bird, one) for one in found) for bird in birds] == [1, 1]
+        assert len(found) == 2
+
+
 @pytest.mark.parametrize(("frames", "keys"), [(1, [0]), (2, [0, 1]), (3, [0, 1, 2]), (8, [1, 4, 6])])
 def test_short_blocks(frames, keys):
     scene = Scene([[place] for place in walk((80, 60), (3, 1), frames)])
