@@ -27,6 +27,7 @@ from jaxfit.foundation.unfinished import Parts
 from jaxfit.foundation.workers import Cluster, open_cluster
 from jaxfit.model.files import load_murre, save_bird
 from jaxfit.perception import detections, track, worker_tasks
+from jaxfit.perception.carried_masks import BLOCK_FRAMES
 from jaxfit.perception.track import run_tracking
 from jaxfit.perception.tracking import load_tracker
 from jaxfit.simulation.scene import simulate
@@ -34,6 +35,7 @@ from jaxfit.simulation.scene import simulate
 pytest.importorskip("distributed")
 FOOTAGE = Footage()
 CONFIG = TrackConfig(min_track_frames=2)
+WHOLE_TASK_FRAMES = worker_tasks.FRAMES_PER_TASK  # before the fixture makes tasks small
 
 
 def networks():
@@ -69,6 +71,10 @@ def test_tracks_are_those_of_one_process(video, workers, frames, tmp_path):
         one, other = np.load(file), np.load(stored[1] / file.name)
         for name in one.files:
             np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_shipped_tasks_hold_whole_blocks():
+    assert WHOLE_TASK_FRAMES % BLOCK_FRAMES == 0
 
 
 def test_tasks_hold_whole_blocks(video, workers, monkeypatch):
