@@ -133,3 +133,14 @@ def test_a_small_bird_of_a_photograph_is_searched_in_parts_of_the_picture(salien
     detector = Near(((48, 48, 72, 72), 0.5))
     (bird,) = DetectorAndSaliency(detector, saliency, 0.3).photograph(frame)
     assert iou(bird, frame) > 0.9
+
+
+@pytest.mark.parametrize("score", [0.9, 0.2])  # certain and doubtful
+def test_known_birds_are_not_segmented_and_not_returned(segmenter, score, monkeypatch):
+    frame = scene((CENTRE, (38, 28)), ((60, 60), (20, 20)))
+    both = segmenter((BOX, 0.95), ((40, 40, 80, 80), score))
+    large, small = both(frame)
+    assert [bird.score for bird in both(frame, [large])] == [small.score]
+    assert [bird.score for bird in both(frame, [small])] == [large.score]
+    monkeypatch.setattr(both, "_saliency", None)  # no run
+    assert both(frame, [large, small]) == []
