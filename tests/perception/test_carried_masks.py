@@ -66,7 +66,7 @@ def assert_masks(found, scene, least):
     for n, birds in enumerate(found):
         truth = scene.birds(n)
         assert len(birds) == len(truth), n
-        assert all(max(mask_iou(bird, true) for true in truth) > least for bird in birds), n
+        assert all(max(mask_iou(bird, true) for bird in birds) > least for true in truth), n
 
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])
