@@ -35,7 +35,7 @@ MARGIN = 0.5
 """Margin on each side of the crop around a bird, as a share of the sides of its box."""
 CROP_PX = 480
 """Longer side of a crop. The flow has a vector for every fourth pixel."""
-_LEAST_PX = 64  # of the shorter side of a crop, because the flow is computed in patches
+_LEAST_PX = 64  # of the shorter side of a crop: the flow is computed in patches, and OpenCV 4 crashes at 24 pixels
 
 
 _Source = tuple[int, int]
