@@ -26,7 +26,8 @@ from jaxfit.perception.network import Instance, instance_of
 BLOCK_FRAMES = 15
 """Frames that share key frames. In longer blocks, the flow would need as much time as the segmenter."""
 VOTES = 3
-"""Number of key frames of a block at first, and of votes that count: the least of which most can agree."""
+"""Number of the first key frames of a block, and largest number of votes for a mask: the smallest number of which most
+can agree."""
 AGREED_IOU = 0.85
 """Votes with a larger IoU agree: as much as the masks that several people draw, 0.85 to 0.91 (Kirillov et al. 2023)."""
 MIN_INSIDE = 0.5
@@ -46,23 +47,23 @@ class _Vote(NamedTuple):
     """A bird of a key frame, carried to another frame."""
 
     source: _Source
-    mask: Instance
+    bird: Instance
 
     @property
     def key(self) -> int:
         return self.source[0]
 
 
-class _Count(NamedTuple):
+class _Tally(NamedTuple):
     """The result of the votes in a frame."""
 
     birds: list[Instance]
     sources: list[set[_Source]]
-    """Whose votes are at the place of each bird."""
+    """For each bird, the sources of all votes at its place."""
     agreed: list[set[_Source]]
-    """Whose votes agree with the mask of each bird."""
+    """For each bird, the sources of the votes that agree with its mask."""
     rest: list[set[_Source]]
-    """Whose votes do not agree, for each place."""
+    """For each place where votes do not agree, their sources."""
 
 
 def segment_block(
@@ -71,32 +72,32 @@ def segment_block(
     """Segment consecutive frames of a film.
 
     Args:
-        segment: returns the birds of a frame beside those that are known in this frame.
+        segment: function of a frame and its known birds; it returns only the other birds.
         frames: at most `BLOCK_FRAMES` frames of the same size; blue, green, red.
 
     Returns:
         The birds of each frame, by falling score.
     """
     greys = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
-    count = len(frames)
+    num_frames = len(frames)
     votes: list[list[_Vote]] = [[] for _ in frames]
-    added = sorted({(2 * part + 1) * count // (2 * VOTES) for part in range(VOTES)})  # the middles of equal parts
-    known = dict.fromkeys(added, _Count([], [], [], []))  # key frame → result of the votes before
+    added = sorted({(2 * part + 1) * num_frames // (2 * VOTES) for part in range(VOTES)})  # the middles of equal parts
+    known = dict.fromkeys(added, _Tally([], [], [], []))  # key frame → result of the votes before
     while True:
         for key in added:
             for number, bird in enumerate(segment(frames[key], known[key].birds)):
                 for n, mask in enumerate(_carried(bird, key, greys)):
                     if mask is not None:
                         votes[n].append(_Vote((key, number), mask))
-        counts, is_open = _counts(votes, known)
-        open_frames = [n for n in range(count) if is_open[n] and n not in known]
+        tallies, is_open = _tally_block(votes, known)
+        open_frames = [n for n in range(num_frames) if is_open[n] and n not in known]
         if not open_frames:
-            return [sorted(of_frame.birds, key=lambda bird: -bird.score) for of_frame in counts]
+            return [sorted(of_frame.birds, key=lambda bird: -bird.score) for of_frame in tallies]
         added = [max(open_frames, key=lambda n: min(abs(n - key) for key in known))]
-        known |= {key: counts[key] for key in added}
+        known |= {key: tallies[key] for key in added}
 
 
-def _counts(votes: Sequence[Sequence[_Vote]], known: Mapping[int, _Count]) -> tuple[list[_Count], list[bool]]:
+def _tally_block(votes: Sequence[Sequence[_Vote]], known: Mapping[int, _Tally]) -> tuple[list[_Tally], list[bool]]:
     """Count the votes of all frames. A bird is not carried beyond a key frame in which it is not.
 
     Args:
@@ -104,37 +105,38 @@ def _counts(votes: Sequence[Sequence[_Vote]], known: Mapping[int, _Count]) -> tu
         known: key frame → birds that the segmenter was not asked for.
 
     Returns:
-        The results, and whether the votes of a frame leave a bird open: they do not agree, and the bird is none of
-        those that are agreed there.
+        The results, and whether a bird of the frame is open: its votes do not agree, and no bird of this frame has
+        these sources.
     """
-    at_keys = {key: _count(key, votes[key], known) for key in known}
-    together = [sources for count in at_keys.values() for sources in count.agreed]
+    at_keys = {key: _tally_frame(key, votes[key], known) for key in known}
+    together = [sources for tally in at_keys.values() for sources in tally.agreed]
 
     def reaches(vote: _Vote, n: int) -> bool:
         between = (key for key in known if min(vote.key, n) < key < max(vote.key, n))
         return all(any(vote.source in sources for sources in at_keys[key].sources) for key in between)
 
-    counts = list[_Count]()
+    tallies = list[_Tally]()
     for n, of_frame in enumerate(votes):
         if n in at_keys:
-            counts.append(at_keys[n])
+            tallies.append(at_keys[n])
             continue
-        counts.append(_count(n, [vote for vote in of_frame if reaches(vote, n)], known))
+        tallies.append(_tally_frame(n, [vote for vote in of_frame if reaches(vote, n)], known))
         if n < min(known) or n > max(known):  # the segmenter may have missed the bird in the first or last key frame
-            counts[n].rest.extend({vote.source} for vote in of_frame if not reaches(vote, n))
+            tallies[n].rest.extend({vote.source} for vote in of_frame if not reaches(vote, n))
 
-    def is_counted(rest: set[_Source], count: _Count) -> bool:
+    def is_counted(rest: set[_Source], tally: _Tally) -> bool:
         same = rest.union(*(sources for sources in together if sources & rest))
-        return any(sources & same for sources in count.agreed)
+        return any(sources & same for sources in tally.agreed)
 
-    return counts, [not all(is_counted(rest, count) for rest in count.rest) for count in counts]
+    return tallies, [not all(is_counted(rest, tally) for rest in tally.rest) for tally in tallies]
 
 
-def _count(n: int, votes: Sequence[_Vote], known: Mapping[int, _Count]) -> _Count:
-    """Count the votes of a frame. A bird is in this key frame, or needs agreeing votes from before and after.
+def _tally_frame(n: int, votes: Sequence[_Vote], known: Mapping[int, _Tally]) -> _Tally:
+    """Count the votes of a frame.
 
-    Where the nearest key frame of a side has no vote, because there is none or because the segmenter was not asked for
-    the bird, the agreeing votes may come from the other side.
+    A frame has a bird if the segmenter saw the bird in this frame, or if votes from an earlier and from a later key
+    frame agree. Where the nearest key frame of a side has no vote, because there is none or because the segmenter was
+    not asked for the bird, the agreeing votes may come from the other side.
     """
     groups: list[list[_Vote]] = []
     for vote in sorted(votes, key=lambda vote: abs(vote.key - n)):
@@ -146,29 +148,31 @@ def _count(n: int, votes: Sequence[_Vote], known: Mapping[int, _Count]) -> _Coun
     around = (
         [n] if n in known else [max(filter(n.__gt__, known), default=None), min(filter(n.__lt__, known), default=None)]
     )
-    result = _Count([], [], [], [])
+    result = _Tally([], [], [], [])
     for group in groups:
         sources = {vote.source for vote in group}
-        from_one_side = any(key is None or any(sources & one for one in known[key].sources) for key in around)
+        one_side_suffices = any(
+            key is None or any(sources & of_bird for of_bird in known[key].sources) for key in around
+        )
         agreed = [
-            vote.mask
+            vote.bird
             for vote in group
             if any(
                 other is not vote
-                and (from_one_side or (vote.key < n) != (other.key < n))
-                and mask_iou(vote.mask, other.mask) > AGREED_IOU
+                and (one_side_suffices or (vote.key < n) != (other.key < n))
+                and mask_iou(vote.bird, other.bird) > AGREED_IOU
                 for other in group
             )
         ]
         if group[0].key != n and not agreed:
             result.rest.append(sources)
             continue
-        bird = group[0].mask if group[0].key == n else _majority(agreed[:VOTES])
+        bird = group[0].bird if group[0].key == n else _majority(agreed[:VOTES])
         if any(mask_iou(bird, other) > MIN_INSIDE for other in result.birds):  # hidden behind the other bird
             continue
         result.birds.append(bird)
         result.sources.append(sources)
-        result.agreed.append({vote.source for vote in group if mask_iou(vote.mask, bird) > AGREED_IOU})
+        result.agreed.append({vote.source for vote in group if mask_iou(vote.bird, bird) > AGREED_IOU})
     return result
 
 
@@ -179,8 +183,8 @@ def _same_iou(vote: _Vote, group: Sequence[_Vote]) -> float:
     """
     if any(other.key == vote.key for other in group):
         return 0.0
-    same = (other.mask for other in group if smaller_inside(vote.mask, other.mask) > MIN_INSIDE)
-    return max((mask_iou(vote.mask, mask) for mask in same), default=0.0)
+    same = (other.bird for other in group if smaller_inside(vote.bird, other.bird) > MIN_INSIDE)
+    return max((mask_iou(vote.bird, mask) for mask in same), default=0.0)
 
 
 def _majority(masks: Sequence[Instance]) -> Instance:

@@ -125,7 +125,8 @@ class FrameDetections(NamedTuple):
     """Width and height."""
     instances: list[Instance]
     distance: Float[np.ndarray, "_"]
-    """Distances of the activations of the segmenter; empty for a network without statistics."""
+    """Distances of the activations of the segmenter; empty for a network without statistics. Those of a block belong to
+    its first frame."""
     keypoints: FrameKeypoints
     """The keypoints of all instances, because crops also hide birds without a track."""
     picture: UInt8[np.ndarray, "H W 3"] | None
@@ -148,7 +149,7 @@ def detect(
 ) -> Generator[FrameDetections | int]:
     """Yield the detections of every frame, by networks in this process; for a damaged frame, yield only its number.
 
-    Threads run the networks on the next frames. A segmenter with the method `block` segments blocks of
+    Threads run the networks on the next frames. A segmenter with the method `segment_block` segments blocks of
     `BLOCK_FRAMES` frames; the first frame of the reader begins a block.
 
     Args:
@@ -159,7 +160,7 @@ def detect(
     """
     for network in (segmenter, keypoints):
         take_distances(network)  # those of an earlier video
-    block = getattr(segmenter, "block", None)
+    block = getattr(segmenter, "segment_block", None)
     if block:
         at_once = max(1, min(at_once, BLOCKS_BYTES // (3 * BLOCK_FRAMES * int(np.prod(reader.info.size_px)))))
 
@@ -212,7 +213,8 @@ def single_opencv_thread() -> Iterator[None]:
 
 
 FRAMES_PER_PART = 50
-"""Frames between two writes, and those to the end of their block: what an interruption costs at most."""
+"""Least number of frames between two writes, which follow the end of a block. An interruption costs the frames since
+the last write."""
 
 _LAYOUT = {  # F frames, M instances, m of them with a track
     "frame_index": "F",

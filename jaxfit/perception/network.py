@@ -89,7 +89,7 @@ def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int
 class Segmenter(Protocol):
     """Detects the instances of a frame.
 
-    A method `block` replaces the call where frames follow each other: it takes at most
+    A method `segment_block` replaces the call where frames follow each other: it takes at most
     `jaxfit.perception.carried_masks.BLOCK_FRAMES` frames, and returns the instances of each.
     """
 

@@ -118,24 +118,25 @@ class DetectorAndSaliency:
         zooms, found = ZOOMS[:1], self._detector(frame)
         if not any(map(self._is_certain, found)):
             zooms, found = ZOOMS, self._detector(frame, *map(View, ZOOMS))
-        certain = [one for one in found if self._is_certain(one)]
         boxes = [Detection(bird.corners_px, bird.score, bird.label) for bird in known]
+        is_known = _box_iou(found, boxes).max(1, initial=0) > MIN_SAME_IOU
+        found = [one for one, skip in zip(found, is_known, strict=True) if not skip]
         birds = list(known)
-        for one, iou in zip(certain, _box_iou(certain, boxes), strict=True):
-            segmented = self._segmented(frame, one, certain) if iou.max(initial=0) <= MIN_SAME_IOU else None
+        others = [one for one in (*found, *boxes) if self._is_certain(one)]
+        for one in filter(self._is_certain, found):
+            segmented = self._segmented(frame, one, others)
             if segmented and all(mask_iou(segmented.bird, bird) <= MIN_SAME_IOU for bird in birds):
                 birds.append(segmented.bird)
         # the mirror image is tested before the masks, because the detector is much faster than the saliency network
-        others = [*certain, *boxes]
         doubtful = [one for one in found if not self._is_certain(one) and not _overlap(one, others)][:MAX_DOUBTFUL]
         mirrored = self._detector(frame, *(View(zoom, mirrored=True) for zoom in zooms)) if doubtful else []
         for one, iou in zip(doubtful, _box_iou(doubtful, mirrored), strict=True):
-            segmented = self._segmented(frame, one, certain) if iou.max(initial=0) > MIN_SAME_IOU else None
+            segmented = self._segmented(frame, one, others) if iou.max(initial=0) > MIN_SAME_IOU else None
             if segmented and not _is_known(segmented.bird, birds) and self._is_confirmed(frame, segmented):
                 birds.append(segmented.bird)
         return birds[len(known) :]
 
-    def block(self, frames: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[list[Instance]]:
+    def segment_block(self, frames: Sequence[UInt8[np.ndarray, "H W 3"]]) -> list[list[Instance]]:
         """Segment consecutive frames, most of them by optical flow (`jaxfit.perception.carried_masks`)."""
         return segment_block(self, frames)
 

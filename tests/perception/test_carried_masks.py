@@ -79,6 +79,18 @@ def test_three_frames_are_segmented_of_birds_that_walk(scale):
         assert [bird.score for bird in birds] == [0.9, 0.8]
 
 
+def test_masks_have_the_pixels_of_most_votes():
+    scene = Scene([[place] for place in walk((80, 60), (0, 0))])
+    for key in (2, 7, 12):
+        (bird,) = scene.birds(key)
+        mask = bird.whole((WIDTH, HEIGHT))
+        mask[60:70, 20 + 2 * key : 30 + 2 * key] ^= True  # another part in each key frame
+        scene.wrong[key] = [instance_of(mask, 0.9, "bird")]
+    found = scene.segment()
+    (truth,) = scene.birds(0)
+    assert all((mask_iou(found[n][0], truth) > 0.99) == (n not in (2, 7, 12)) for n in range(BLOCK_FRAMES))
+
+
 @pytest.mark.parametrize("key", [2, 7, 12])
 @pytest.mark.parametrize("error", ["half", "nothing", "other"])
 def test_an_error_in_one_key_frame_stays_there(key, error):

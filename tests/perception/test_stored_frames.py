@@ -101,9 +101,9 @@ def test_a_block_of_damaged_frames_is_not_segmented(video, monkeypatch, block_fr
     blocks = []
 
     class Recording(BlockSegmenter):
-        def block(self, frames):
+        def segment_block(self, frames):
             blocks.append(len(frames))
-            return super().block(frames)
+            return super().segment_block(frames)
 
     result = run_tracking(video, TrackConfig(frames=FramesConfig(0, 7)), Recording(FOOTAGE), TrueKeypoints(FOOTAGE))
     assert result.damaged_frames == [6]

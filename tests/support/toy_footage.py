@@ -93,7 +93,7 @@ class TrueSegmenter:
 class BlockSegmenter(TrueSegmenter):
     """Segments blocks of frames; the score of a bird is its position in the block."""
 
-    def block(self, frames):
+    def segment_block(self, frames):
         return [[bird._replace(score=0.9 - 0.1 * n) for bird in self(frame)] for n, frame in enumerate(frames)]
 
 
