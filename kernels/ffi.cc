@@ -72,14 +72,14 @@ ffi::Error silhouette_gradient(ffi::ThreadPool pool, Floats vertices, Indices fa
   return ffi::Error::Success();
 }
 
-// The skins of a batch. `slope` is (J, 3, 4, P) and `shape` is (V, 3, S), with P and S multiples of 16 and D = P + S.
+// The skins of a batch. `generators` is (3, 4, P) and `shape` is (V, 3, S), with P and S multiples of 16 and D = P + S.
 struct Skins {
   Skin first;  // with the pointers of the first item
-  Operand rest_at, joint_at, weight_at, slope_at, linear_at, shape_at;
+  Operand rest_at, joint_at, weight_at, transforms_at, generators_at, moved_at, view_at, shape_at;
 
   Skins(const Batch& batch, int64_t num_vertices, int64_t parameters, const Floats& rest, const Indices& joint,
-        const Floats& weight, const Floats& slope, const Floats& linear, const Floats& shape, float focal,
-        float centre) {
+        const Floats& weight, const Floats& transforms, const Floats& generators, const Floats& moved,
+        const Floats& view, const Floats& shape, float focal, float centre) {
     const int64_t shapes = shape.dimensions().size() ? shape.dimensions()[shape.dimensions().size() - 1] : 0;
     const int64_t transforming = parameters - shapes;
     if (transforming < 1 || transforming % 16 || shapes % 16)
@@ -88,14 +88,17 @@ struct Skins {
     rest_at = bind("rest", rest.dimensions(), batch, {num_vertices, 3});
     joint_at = bind("joint", joint.dimensions(), batch, {num_vertices, kAny});
     const int64_t joints = num_vertices ? joint_at.item / num_vertices : 0;
+    if (joints > kMostInfluences) throw std::invalid_argument("joint: expected at most 8 joints per vertex");
     weight_at = bind("skin_weight", weight.dimensions(), batch, {num_vertices, joints});
-    slope_at = bind("slope", slope.dimensions(), batch, {kAny, 3, 4, transforming});
-    const int64_t transforms = slope_at.item / (12 * transforming);
-    check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, transforms);
-    linear_at = bind("linear", linear.dimensions(), batch, {transforms, 3, 3});
+    transforms_at = bind("transforms", transforms.dimensions(), batch, {kAny, 3, 4});
+    check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, transforms_at.item / 12);
+    generators_at = bind("generators", generators.dimensions(), batch, {3, 4, transforming});
+    moved_at = bind("moved", moved.dimensions(), batch, {transforms_at.item / 12, transforming});
+    view_at = bind("view", view.dimensions(), batch, {3, 3});
     shape_at = bind("shape", shape.dimensions(), batch, {num_vertices, 3, shapes});
-    first = {rest.typed_data(),   joint.typed_data(), weight.typed_data(), slope.typed_data(),
-             linear.typed_data(), shape.typed_data(), joints, transforming, parameters, focal, centre};
+    first = {rest.typed_data(), joint.typed_data(), weight.typed_data(), transforms.typed_data(),
+             generators.typed_data(), moved.typed_data(), view.typed_data(), shape.typed_data(),
+             joints, transforming, parameters, focal, centre};
   }
 
   Skin of(const Batch& batch, int64_t image) const {
@@ -103,8 +106,10 @@ struct Skins {
     skin.rest += rest_at.offset(batch, image);
     skin.joint += joint_at.offset(batch, image);
     skin.weight += weight_at.offset(batch, image);
-    skin.slope += slope_at.offset(batch, image);
-    skin.linear += linear_at.offset(batch, image);
+    skin.transforms += transforms_at.offset(batch, image);
+    skin.generators += generators_at.offset(batch, image);
+    skin.moved += moved_at.offset(batch, image);
+    skin.view += view_at.offset(batch, image);
     skin.shape += shape_at.offset(batch, image);
     return skin;
   }
@@ -178,8 +183,8 @@ ffi::Error mask_loss_and_gradient(ffi::ThreadPool pool, Floats vertices, Indices
 }
 
 ffi::Error mask_loss_gradient_and_block(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target,
-                                        Floats weight, Floats rest, Indices joint, Floats skin_weight, Floats slope,
-                                        Floats linear, Floats shape, ffi::Result<Floats> loss,
+                                        Floats weight, Floats rest, Indices joint, Floats skin_weight, Floats transforms,
+                                        Floats generators, Floats moved, Floats view, Floats shape, ffi::Result<Floats> loss,
                                         ffi::Result<Floats> gradient, ffi::Result<Floats> block, float sigma,
                                         float radius, int32_t edge, int32_t kind, float focal, float centre) {
   const Loss how(sigma, radius, edge, kind);
@@ -188,8 +193,8 @@ ffi::Error mask_loss_gradient_and_block(ffi::ThreadPool pool, Floats vertices, I
   check_result("gradient", gradient->dimensions(), batch, {meshes.num_vertices, 3});
   const int64_t parameters = block->dimensions().size() ? block->dimensions()[block->dimensions().size() - 1] : 0;
   check_result("block", block->dimensions(), batch, {parameters, parameters});
-  const Skins skins(batch, meshes.num_vertices, parameters, rest, joint, skin_weight, slope, linear, shape, focal,
-                    centre);
+  const Skins skins(batch, meshes.num_vertices, parameters, rest, joint, skin_weight, transforms, generators, moved,
+                    view, shape, focal, centre);
   return run_mask_loss(pool, batch, meshes, target, weight, how, loss->typed_data(), gradient->typed_data(), &skins,
                        block->typed_data());
 }
@@ -261,6 +266,8 @@ XLA_FFI_Error* mask_loss_gradient_and_block_handler(XLA_FFI_CallFrame* frame) {
     static const auto* handler = with_mesh_and_target()
                                      .Arg<Floats>()
                                      .Arg<Indices>()
+                                     .Arg<Floats>()
+                                     .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Arg<Floats>()

@@ -27,19 +27,24 @@ struct Target {
   const float* floats;
 };
 
-// A mesh posed by linear blend skinning: vertex v lies at Σ_m weight[v, m] · B[joint[v, m]] · (rest[v], 1) in the camera
-// frame, where B (J, 3, 4) depends on P parameters. S further parameters move the vertices at rest. D = P + S.
+constexpr int64_t kMostInfluences = 8;
+
+// A mesh posed by linear blend skinning: vertex v lies at view · Σ_m weight[v, m] · B[joint[v, m]] · (rest[v], 1), and a
+// constant, in the camera frame. The derivative of B[j] with respect to parameter p is moved[j, p] · G[p] · [B[j]; 0 0 0 1],
+// for P parameters. S further parameters move the vertices at rest. D = P + S.
 struct Skin {
-  const float* rest;      // (V, 3)
-  const int32_t* joint;   // (V, M)
-  const float* weight;    // (V, M); entries of weight 0 are skipped
-  const float* slope;     // (J, 3, 4, P): derivatives of B
-  const float* linear;    // (J, 3, 3): B without its last column
-  const float* shape;     // (V, 3, S): derivatives of the vertices at rest
-  int64_t per_vertex;     // M
-  int64_t transforming;   // P, a multiple of 16
-  int64_t parameters;     // D, a multiple of 16
-  float focal, centre;    // px of the silhouette
+  const float* rest;        // (V, 3)
+  const int32_t* joint;     // (V, M)
+  const float* weight;      // (V, M); entries of weight 0 are skipped
+  const float* transforms;  // (J, 3, 4): B
+  const float* generators;  // (3, 4, P): G
+  const float* moved;       // (J, P): 1 where a parameter moves a joint, and else 0
+  const float* view;        // (3, 3)
+  const float* shape;       // (V, 3, S): derivatives of the vertices at rest
+  int64_t per_vertex;       // M, at most kMostInfluences
+  int64_t transforming;     // P, a multiple of 16
+  int64_t parameters;       // D, a multiple of 16
+  float focal, centre;      // px of the silhouette
 };
 
 // The entry points of one kind of edge and one instruction set. `gradient` is (V, 3) and is overwritten. Its depth column is 0.

@@ -21,26 +21,39 @@ struct VertexRows {
   const float* at = mesh.vertices + 3 * v;
   const float* rest = skin.rest + 3 * v;
   const float zoom = skin.focal / at[2];
-  const float by_depth[2] = {(skin.centre - at[0]) / at[2], (skin.centre - at[1]) / at[2]};
-  float linear[9] = {};  // of the vertex: moves a displacement at rest to the camera frame
-  for (int64_t m = 0; S && m < skin.per_vertex; ++m) {
-    const int64_t entry = v * skin.per_vertex + m;
-    for (int k = 0; k < 9; ++k) linear[k] += skin.weight[entry] * skin.linear[9 * skin.joint[entry] + k];
+  float onto[2][3];  // of x and y in px, by a displacement before the view
+  for (int i = 0; i < 2; ++i)
+    for (int c = 0; c < 3; ++c)
+      onto[i][c] = zoom * skin.view[3 * i + c] + (skin.centre - at[i]) / at[2] * skin.view[6 + c];
+  float linear[3][3] = {}, points[kMostInfluences][4];  // Σ weight · B without its last column, weight · (B · rest, 1)
+  const float* moved[kMostInfluences];
+  int64_t used = 0;
+  for (int64_t m = v * skin.per_vertex; m < (v + 1) * skin.per_vertex; ++m) {
+    const float w = skin.weight[m];
+    if (w == 0) continue;
+    for (int i = 0; i < 3; ++i) {
+      const float* B = skin.transforms + 12 * skin.joint[m] + 4 * i;
+      for (int c = 0; c < 3; ++c) linear[i][c] += w * B[c];
+      points[used][i] = w * (B[0] * rest[0] + B[1] * rest[1] + B[2] * rest[2] + B[3]);
+    }
+    moved[used] = skin.moved + skin.joint[m] * P;
+    points[used++][3] = w;
   }
   for (int64_t d = 0; d < D; d += kWidth) {
-    Vec x[3] = {all(0.f), all(0.f), all(0.f)};  // d position / d parameters, camera frame
-    for (int64_t m = 0; d < P && m < skin.per_vertex; ++m) {
-      const float w = skin.weight[v * skin.per_vertex + m];
-      if (w == 0) continue;
-      const float* slope = skin.slope + skin.joint[v * skin.per_vertex + m] * 12 * P + d;
-      for (int i = 0; i < 3; ++i, slope += 4 * P)
-        for (int c = 0; c < 4; ++c) x[i] = fma(all(c < 3 ? w * rest[c] : w), load(slope + c * P), x[i]);
+    Vec x[3] = {all(0.f), all(0.f), all(0.f)};  // d position / d parameters, before the view
+    if (d < P) {
+      Vec point[4] = {all(0.f), all(0.f), all(0.f), all(0.f)};  // of the joints that each parameter moves
+      for (int64_t m = 0; m < used; ++m)
+        for (int c = 0; c < 4; ++c) point[c] = fma(all(points[m][c]), load(moved[m] + d), point[c]);
+      for (int i = 0; i < 3; ++i)
+        for (int c = 0; c < 4; ++c) x[i] = fma(load(skin.generators + (4 * i + c) * P + d), point[c], x[i]);
     }
     for (int c = 0; d >= P && c < 3; ++c) {
-      const Vec moved = load(skin.shape + (3 * v + c) * S + d - P);
-      for (int i = 0; i < 3; ++i) x[i] = fma(all(linear[3 * i + c]), moved, x[i]);
+      const Vec shape = load(skin.shape + (3 * v + c) * S + d - P);
+      for (int i = 0; i < 3; ++i) x[i] = fma(all(linear[i][c]), shape, x[i]);
     }
-    for (int i = 0; i < 2; ++i) store(out + i * D + d, fma(all(zoom), x[i], all(by_depth[i]) * x[2]));
+    for (int i = 0; i < 2; ++i)
+      store(out + i * D + d, fma(all(onto[i][0]), x[0], fma(all(onto[i][1]), x[1], all(onto[i][2]) * x[2])));
   }
   return out;
 }

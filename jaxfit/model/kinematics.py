@@ -342,15 +342,15 @@ def window_keypoint_derivatives(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose
     return each_frame(lambda frame, A: keypoint_derivatives(rig, A, frame, name), pose, A)
 
 
-def transform_derivatives(
+def transform_generators(
     rig: Rig, A: Float[Array, "J 3 4"], pose: Pose, with_bones: bool = False
-) -> Float[Array, "J 3 4 D"]:
-    """Return the derivatives of the joint transforms in the camera frame, B_d = [s·R_d | s·t_d + τ].
+) -> Float[Array, "3 4 P"]:
+    """Return the factors G_p of the derivatives dB_d/dp = G_p·[B_d; 0 0 0 1] of the scaled transforms B_d = s·A_d.
 
-    A rest point v is posed at Σ_d w_d · B_d·(v, 1). The columns are the axis-angles of all joints, root first (3J),
-    the translation τ (3), the scale s (1) and, with `with_bones`, the lengths of the bones (J−1). A rotation of joint j
-    by ω rotates the transforms of joint j and of its descendants about the posed position p_j of the joint, with
-    ω = R_j·Jr(θ_j)·dθ_j.
+    The factors hold for the joints d that the parameter p moves (`moved_joints`); the others have derivatives of 0. A
+    rest point v is posed at Σ_d w_d · B_d·(v, 1) + τ. The parameters are the axis-angles of all joints, root first
+    (3J), the translation τ (3), the scale s (1) and, with `with_bones`, the lengths of the bones (J−1). A change dθ_j
+    rotates by ω = R_j·Jr(θ_j)·dθ_j about the posed position p_j of the joint: G = [[ω]× | −ω × p_j].
 
     Args:
         rig: the folded bird.
@@ -359,31 +359,34 @@ def transform_derivatives(
         with_bones: whether the lengths of the bones have columns.
 
     Returns:
-        The derivatives, model units per radian, per model unit, per unit of scale, and per unit of bone length.
+        The factors, per radian, per model unit, per unit of scale, and per unit of bone length.
 
     Source: the geometric Jacobian, Siciliano et al. 2009, Robotics, section 3.1.
     """
-    count = len(rig.parents)
-    descendants = jnp.asarray(_descendants(rig.parents), jnp.float32)
-    turn = _turns(A, pose)
-    centre = jnp.pad(unit_joints(rig, A).T[:, None], ((0, 0), (3, 0), (0, 0)))  # (3, 4, J): 0 but for the last column
-    arm = pose.scale * descendants[:, None, None] * (A[..., None] - centre)  # (J, 3, 4, J)
-    (ax, ay, az), (tx, ty, tz) = jnp.moveaxis(arm[..., None], 1, 0), jnp.moveaxis(turn, 1, 0)
-    by_angles = jnp.stack([ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax], axis=1)  # (J, 3, 4, J, 3)
-    last = jnp.array([0.0, 0.0, 0.0, 1.0])
-    by_transl = jnp.broadcast_to(jnp.eye(3)[:, None] * last[:, None], (count, 3, 4, 3))
-    columns = [by_angles.reshape(count, 3, 4, -1), by_transl, A[..., None]]
+    scale = jnp.asarray(pose.scale)
+    turn = _turns(A, pose).swapaxes(1, 2)  # the rotations of a joint in its rows
+    arm = jnp.pad(-scale * unit_joints(rig, A)[:, None], ((0, 0), (3, 0), (0, 0))) + jnp.eye(4, 3)  # (J, 4, 3)
+    by_angles = jnp.cross(turn[:, None], arm[:, :, None])  # (J, 4, 3 angles, 3)
+    by_angles = by_angles.transpose(3, 1, 0, 2).reshape(3, 4, -1)
+    last = jnp.array([0.0, 0.0, 0.0, 1.0])[:, None]
+    columns = [by_angles, jnp.eye(3)[:, None] * last, jnp.eye(3, 4)[..., None] / scale]
     if with_bones:
-        moved = jnp.asarray(pose.scale) * descendants[:, None, 1:] * _bone_vectors(rig, A).T  # (J, 3, J−1)
-        columns.append(moved[:, :, None] * last[:, None])
+        columns.append(scale * _bone_vectors(rig, A).T[:, None] * last)
     return jnp.concatenate(columns, axis=-1)
 
 
-def window_transform_derivatives(
+def window_transform_generators(
     rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose, with_bones: bool = False
-) -> Float[Array, "T J 3 4 D"]:
-    """Return `transform_derivatives` of every frame of a window."""
-    return each_frame(lambda frame, A: transform_derivatives(rig, A, frame, with_bones), pose, A)
+) -> Float[Array, "T 3 4 P"]:
+    """Return `transform_generators` of every frame of a window."""
+    return each_frame(lambda frame, A: transform_generators(rig, A, frame, with_bones), pose, A)
+
+
+def moved_joints(rig: Rig, with_bones: bool = False) -> Float[np.ndarray, "J P"]:
+    """Return 1 where a parameter of `transform_generators` moves a joint, and else 0."""
+    descendants = _descendants(rig.parents).astype(np.float32)
+    columns = [np.repeat(descendants, 3, axis=1), np.ones_like(descendants[:, :1]).repeat(4, axis=1)]
+    return np.concatenate([*columns, descendants[:, 1:]] if with_bones else columns, axis=1)
 
 
 def _bone_vectors(rig: Rig, A: Float[Array, "J 3 4"]) -> Float[Array, "bones 3"]:

@@ -17,12 +17,13 @@ from jaxfit.model.camera import CropCamera, project, to_screen
 from jaxfit.model.kinematics import (
     Pose,
     Rig,
+    moved_joints,
     shaped_vertices,
     window_joints,
     window_keypoint_derivatives,
     window_keypoint_rows,
     window_keypoints,
-    window_transform_derivatives,
+    window_transform_generators,
     window_transforms,
     window_vertices,
 )
@@ -300,20 +301,24 @@ class PosedWindow:
 
     @cached_property
     def skin(self) -> Skin:
-        """Derivatives of the vertices with respect to a row of `curvature.frame_rows`, in factors. Only `slope`
-        (I, J, 3, 4, P) and `linear` (I, J, 3, 3) have a leading axis of images. They are constants for JAX."""
+        """Derivatives of the vertices with respect to a row of `curvature.frame_rows`, in factors. Only
+        `transforms`, `generators` and `view` have a leading axis of images I. They are constants for JAX."""
         pose, transforms = jax.lax.stop_gradient((self.pose, self._transforms))
         rest = shaped_vertices(self._rig, pose)
-        slope = window_transform_derivatives(self._rig, transforms, pose, "bone_length" in self.shared)
-        linear = jnp.reshape(pose.scale, (-1, 1, 1, 1)) * transforms[..., :3]
+        with_bones = "bone_length" in self.shared
+        generators = window_transform_generators(self._rig, transforms, pose, with_bones)
+        transforms = jnp.reshape(pose.scale, (-1, 1, 1, 1)) * transforms
+        view = jnp.broadcast_to(jnp.eye(3), (len(transforms), 3, 3))
         shape_basis = self._rig.shape_basis.transpose(2, 1, 0)
         if "betas" not in self.shared:
             shape_basis = shape_basis[..., :0]
         views = self.targets.views
         if views is not None:
-            slope = jnp.einsum("tvab,tjbcd->tvjacd", views.linear, slope).reshape(-1, *slope.shape[1:])
-            linear = jnp.einsum("tvab,tjbc->tvjac", views.linear, linear).reshape(-1, *linear.shape[1:])
-        return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope, linear, shape_basis)
+            view = jnp.reshape(views.linear, (-1, 3, 3))
+            transforms, generators = (jnp.repeat(x, views.linear.shape[1], axis=0) for x in (transforms, generators))
+        moved = jnp.asarray(moved_joints(self._rig, with_bones))
+        weights = self._rig.vertex_joints, self._rig.vertex_weights
+        return Skin(rest.T, *weights, transforms, generators, moved, view, shape_basis)
 
     @property
     def mask(self) -> UInt8[Array | np.ndarray, "I H W"]:

@@ -44,11 +44,11 @@ def _mask_and_blocks(window: PosedWindow, kind: Kind) -> tuple[Scalar, FrameBloc
     camera_px = window.camera.focal_px * ratio, window.camera.centre_px * ratio
     raster = {"kind": kind, "blur": window.raster.blur, "backend": window.raster.backend}
 
-    def frame(vertices_screen, target, weight, slope, linear):
-        skin = window.skin._replace(slope=slope, linear=linear)
+    def frame(vertices_screen, target, weight, transforms, generators, view):
+        skin = window.skin._replace(transforms=transforms, generators=generators, view=view)
         return mask_loss_and_block(vertices_screen, window.faces, target, weight, skin, camera_px, **raster)
 
-    skin = window.skin.slope, window.skin.linear
+    skin = window.skin.transforms, window.skin.generators, window.skin.view
     values, blocks = jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window), *skin)
     if window.targets.views is not None:
         blocks = blocks.reshape(len(window.present), -1, *blocks.shape[1:]).sum(axis=1)

@@ -191,16 +191,17 @@ def mask_loss_gradient_and_block(
     blur: Blur,
 ) -> tuple[Float[Array, ""], Float[Array, "V 3"], Float[Array, "D D"]]:
     """Return `mask_loss_and_gradient` and the unweighted Gauss-Newton block, which is 0 for a weight of 0."""
-    slope, shape_basis = _padded(skin.slope), _padded(skin.shape_basis)
-    padded = slope.shape[-1] + shape_basis.shape[-1]
+    generators, moved, shape_basis = (_padded(x) for x in (skin.generators, skin.moved, skin.shape_basis))
+    padded = moved.shape[-1] + shape_basis.shape[-1]
     shapes = ((), vertices.shape, (padded, padded))
     results = tuple(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
-    operands = (vertices, faces, target, weight, skin.rest, skin.joint, skin.weight, slope, skin.linear, shape_basis)
+    operands = (vertices, faces, target, weight, skin.rest, skin.joint, skin.weight, skin.transforms)
+    operands += (generators, moved, skin.view, shape_basis)
     focal, centre = (np.float32(x) for x in camera_px)
     settings = {"kind": np.int32(KINDS.index(kind)), "focal": focal, "centre": centre}
     loss, gradient, block = _call("jaxfit_mask_loss_gradient_and_block", results, *operands, blur=blur, **settings)
-    parameters, own_shapes = skin.slope.shape[-1], skin.shape_basis.shape[-1]
-    kept = np.r_[:parameters, slope.shape[-1] : slope.shape[-1] + own_shapes]
+    parameters, own_shapes = skin.moved.shape[-1], skin.shape_basis.shape[-1]
+    kept = np.r_[:parameters, moved.shape[-1] : moved.shape[-1] + own_shapes]
     return loss, gradient, block[kept][:, kept] if own_shapes else block[:parameters, :parameters]
 
 

@@ -65,8 +65,8 @@ class Blur:
 
 
 class Skin(NamedTuple):
-    """A mesh posed by linear blend skinning. Vertex v lies at Σ_m weight[v, m] · B[joint[v, m]] · (rest[v], 1) in the
-    camera frame, where the transforms B (J, 3, 4) depend on D parameters."""
+    """A mesh posed by linear blend skinning. Vertex v lies at view · Σ_m weight[v, m] · B[joint[v, m]] · (rest[v], 1),
+    and a constant, in the camera frame. The transforms B (J, 3, 4) and the rest vertices depend on D parameters."""
 
     rest: Float[Array, "V 3"]
     """Vertices at rest."""
@@ -74,10 +74,14 @@ class Skin(NamedTuple):
     """The joints that move each vertex."""
     weight: Float[Array, "V M"]
     """Their skinning weights; 0 for entries that are not used."""
-    slope: Float[Array, "J 3 4 P"]
-    """Derivatives of B with respect to P parameters."""
-    linear: Float[Array, "J 3 3"]
-    """B without its last column: how the joints turn and scale a displacement of the rest vertices."""
+    transforms: Float[Array, "J 3 4"]
+    """B."""
+    generators: Float[Array, "3 4 P"]
+    """G: the derivative of B[j] with respect to parameter p of P is moved[j, p] · G[..., p] · [B[j]; 0 0 0 1]."""
+    moved: Float[Array, "J P"]
+    """1 where a parameter moves a joint, and else 0."""
+    view: Float[Array, "3 3"]
+    """The linear part of the map to the camera frame."""
     shape_basis: Float[Array, "V 3 S"]
     """Derivatives of the rest vertices with respect to S parameters that follow the P parameters; D = P + S."""
 
@@ -270,9 +274,11 @@ def silhouette_gauss_newton(
     missing = weight == 0
     vertices = jnp.where(missing, 1.0, vertices)
     rest = jnp.concatenate([skin.rest, jnp.ones_like(skin.rest[:, :1])], axis=1)
-    by_transforms = jnp.einsum("vm,vmicd,vc->dvi", skin.weight, skin.slope[skin.joint], rest)
-    by_shape = jnp.einsum("vm,vmic,vcs->svi", skin.weight, skin.linear[skin.joint], skin.shape_basis)
-    moved_cam = jnp.concatenate([by_transforms, by_shape])  # (D, V, 3)
+    transforms = jnp.pad(skin.transforms, ((0, 0), (0, 1), (0, 0))).at[:, 3, 3].set(1)[skin.joint]  # (V, M, 4, 4)
+    points = jnp.einsum("vm,vmcd,vd,vmp->vcp", skin.weight, transforms, rest, skin.moved[skin.joint])
+    by_transforms = jnp.einsum("icp,vcp->pvi", skin.generators, points)
+    by_shape = jnp.einsum("vm,vmic,vcs->svi", skin.weight, transforms[..., :3, :3], skin.shape_basis)
+    moved_cam = jnp.concatenate([by_transforms, by_shape]) @ skin.view.T  # (D, V, 3)
     depth = vertices[:, 2:]
     moved_px = (focal * moved_cam[..., :2] - (vertices[:, :2] - centre) * moved_cam[..., 2:]) / depth
     tangents = jnp.concatenate([moved_px, moved_cam[..., 2:]], axis=-1)

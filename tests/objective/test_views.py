@@ -101,3 +101,28 @@ def test_curvature_of_views_is_that_of_automatic_differentiation():
     np.testing.assert_allclose(
         found.reshape(expected.shape), expected, rtol=2e-3, atol=2e-3 * float(np.abs(expected).max())
     )
+
+
+def test_skin_of_views_is_that_of_automatic_differentiation():
+    """The change of the vertices on the screen by the factors of the skin and by JAX, in two different views."""
+    targets = seen_by(np.eye(3) + 0.05 * RNG.normal(size=(T, 2, 3, 3)), 0.5 * RNG.normal(size=(T, 2, 3)))
+    bones = ("bone_length",)
+    direction = np.float32(RNG.normal(size=frame_rows(POSE, bones).shape))
+    direction[:, frame_rows(POSE).shape[1] :] = direction[:1, frame_rows(POSE).shape[1] :]
+
+    @jax.jit
+    def both(pose, direction):
+        def screen(rows):
+            return posed_window(add_rows(pose, rows, bones), targets).vertices_screen
+
+        skin = posed_window(pose, targets, shared=bones).skin
+        return *jax.jvp(screen, (jnp.zeros_like(direction),), (direction,)), skin
+
+    at, expected, skin = both(POSE, direction)
+    B = np.pad(skin.transforms, ((0, 0), (0, 0), (0, 1), (0, 0))) + np.diag([0, 0, 0, 1])
+    rest = np.pad(skin.rest, ((0, 0), (0, 1)), constant_values=1)
+    points = np.einsum("vm,ivmcd,vd,vmp->ivcp", skin.weight, B[:, skin.joint], rest, skin.moved[skin.joint])
+    moved = np.einsum("iab,ibcp,ivcp,ip->iva", skin.view, skin.generators, points, np.repeat(direction, 2, axis=0))
+    camera = terms_by_hand.CAMERA
+    moved_px = (camera.focal_px * moved[..., :2] - (at[..., :2] - camera.centre_px) * moved[..., 2:]) / at[..., 2:]
+    np.testing.assert_allclose(moved_px, expected[..., :2], atol=1e-4 * float(np.abs(expected[..., :2]).max()))

@@ -14,9 +14,10 @@ from jaxfit.model.kinematics import (
     Pose,
     fold_bird,
     joint_transforms,
+    moved_joints,
     posed_vertices,
     shaped_vertices,
-    transform_derivatives,
+    transform_generators,
 )
 from jaxfit.raster import silhouette as raster
 from jaxfit.raster import silhouette_reference
@@ -62,9 +63,9 @@ def posed(row):
     """Return the vertices on the screen, and the skin."""
     pose = pose_of(row)
     A, rest = joint_transforms(RIG, pose), shaped_vertices(RIG, pose).T
-    slope = transform_derivatives(RIG, A, pose, with_bones=True)
-    of_shape = pose.scale * A[..., :3], RIG.shape_basis.transpose(2, 1, 0)
-    return on_screen(row), Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope, *of_shape)
+    generators, moved = transform_generators(RIG, A, pose, with_bones=True), jnp.asarray(moved_joints(RIG, True))
+    factors = pose.scale * A, generators, moved, jnp.eye(3), RIG.shape_basis.transpose(2, 1, 0)
+    return on_screen(row), Skin(rest, RIG.vertex_joints, RIG.vertex_weights, *factors)
 
 
 @functools.partial(jax.jit, static_argnames="blur")
@@ -215,7 +216,10 @@ def test_derivatives_and_weights_of_the_rig():
         return jnp.concatenate([pose.scale * A[..., :3], (pose.scale * A[..., 3] + pose.transl)[..., None]], axis=-1)
 
     expected = jax.jit(jax.jacfwd(transforms))(row_of())[..., : PLACED + 3]
-    np.testing.assert_allclose(posed(row_of())[1].slope, expected, atol=1e-5 * np.abs(expected).max())
+    skin = posed(row_of())[1]
+    B = np.pad(skin.transforms, ((0, 0), (0, 1), (0, 0))) + np.diag([0, 0, 0, 1])
+    found = np.einsum("jp,icp,jcd->jidp", skin.moved, skin.generators, B)
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
     dense = np.zeros(np.shape(BIRD.skin_weights))
     np.put_along_axis(dense, np.asarray(RIG.vertex_joints), np.asarray(RIG.vertex_weights), axis=1)
     np.testing.assert_allclose(dense, BIRD.skin_weights, atol=1e-7)

@@ -88,13 +88,14 @@ def test_the_renderer_rejects_shapes_that_do_not_fit(function, changed, message)
         call_renderer(function, **changed)
 
 
+TRANSFORMS = ("transforms", "generators", "moved")
 HANDLERS = {
     "jaxfit_silhouette": (("vertices", "faces"), ("image",)),
     "jaxfit_silhouette_gradient": (("vertices", "faces", "cotangent"), ("gradient",)),
     "jaxfit_mask_loss": (("vertices", "faces", "target", "weight"), ("loss",)),
     "jaxfit_mask_loss_and_gradient": (("vertices", "faces", "target", "weight"), ("loss", "gradient")),
     "jaxfit_mask_loss_gradient_and_block": (
-        ("vertices", "faces", "mask", "weight", "rest", "joint", "skin_weight", "slope", "linear", "shape"),
+        ("vertices", "faces", "mask", "weight", "rest", "joint", "skin_weight", *TRANSFORMS, "view", "shape"),
         ("loss", "gradient", "block"),
     ),
 }
@@ -112,8 +113,10 @@ SHAPES = {
     "rest": (1, V, 3),
     "joint": (1, V, 2),
     "skin_weight": (1, V, 2),
-    "slope": (B, 2, 3, 4, 16),
-    "linear": (B, 2, 3, 3),
+    "transforms": (B, 2, 3, 4),
+    "generators": (B, 3, 4, 16),
+    "moved": (1, 2, 16),
+    "view": (B, 3, 3),
     "shape": (1, V, 3, 0),
     "block": (B, 16, 16),
 }
@@ -161,8 +164,9 @@ def test_the_handlers_accept_shapes_that_fit():
         ("jaxfit_mask_loss_gradient_and_block", {"block": (B, 16, 32)}, r"block: .*\(2, 32, 32\), got \(2, 16, 32\)"),
         ("jaxfit_mask_loss_gradient_and_block", {"block": (B, 8, 8)}, "block: expected a multiple of 16 parameters"),
         ("jaxfit_mask_loss_gradient_and_block", {"rest": (B, 1, 3)}, r"rest: .*\(3, 3\), got \(2, 1, 3\)"),
-        ("jaxfit_mask_loss_gradient_and_block", {"linear": (B, 1, 3, 3)}, r"linear: .*\(2, 3, 3\), got \(2, 1, 3, 3\)"),
-        ("jaxfit_mask_loss_gradient_and_block", {"slope": (B, 0, 3, 4, 16)}, r"joint: an index is not in \[0, 0\)"),
+        ("jaxfit_mask_loss_gradient_and_block", {"moved": (B, 1, 16)}, r"moved: .*\(2, 16\), got \(2, 1, 16\)"),
+        ("jaxfit_mask_loss_gradient_and_block", {"joint": (1, V, 9)}, "joint: expected at most 8 joints per vertex"),
+        ("jaxfit_mask_loss_gradient_and_block", {"transforms": (B, 0, 3, 4)}, r"joint: an index is not in \[0, 0\)"),
     ],
 )
 def test_the_handlers_reject_shapes_that_do_not_fit(handler, changed, message):
