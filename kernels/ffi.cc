@@ -88,7 +88,7 @@ struct Skins {
     rest_at = bind("rest", rest.dimensions(), batch, {num_vertices, 3});
     joint_at = bind("joint", joint.dimensions(), batch, {num_vertices, kAny});
     const int64_t joints = num_vertices ? joint_at.item / num_vertices : 0;
-    if (joints > kMostInfluences) throw std::invalid_argument("joint: expected at most 8 joints per vertex");
+    if (joints > kMostInfluences) throw std::invalid_argument("joint: expected at most " + std::to_string(kMostInfluences) + " joints per vertex");
     weight_at = bind("skin_weight", weight.dimensions(), batch, {num_vertices, joints});
     transforms_at = bind("transforms", transforms.dimensions(), batch, {kAny, 3, 4});
     check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, transforms_at.item / 12);

@@ -20,8 +20,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxfit.perception.merging import mask_iou, smaller_inside
+from jaxfit.perception.merging import MIN_SAME_IOU, mask_iou, smaller_inside
 from jaxfit.perception.network import Instance, instance_of
+from jaxfit.perception.segmentation_inputs import enlarge
 
 BLOCK_FRAMES = 15
 """Frames that share key frames. In longer blocks, the flow would need as much time as the segmenter."""
@@ -168,7 +169,7 @@ def _tally_frame(n: int, votes: Sequence[_Vote], known: Mapping[int, _Tally]) ->
             result.rest.append(sources)
             continue
         bird = group[0].bird if group[0].key == n else _majority(agreed[:VOTES])
-        if any(mask_iou(bird, other) > MIN_INSIDE for other in result.birds):  # hidden behind the other bird
+        if any(mask_iou(bird, other) > MIN_SAME_IOU for other in result.birds):  # hidden behind the other bird
             continue
         result.birds.append(bird)
         result.sources.append(sources)
@@ -203,10 +204,8 @@ def _majority(masks: Sequence[Instance]) -> Instance:
 
 def _carried(bird: Instance, key: int, greys: Sequence[UInt8[np.ndarray, "H W"]]) -> list[Instance | None]:
     """Return the bird of a key frame in every frame, by the flow between the frames around it; None where it left."""
-    height, width = bird.mask.shape
-    low = np.floor(np.array([bird.x0 - MARGIN * width, bird.y0 - MARGIN * height])).astype(int)
-    high = np.ceil(np.array([bird.x0 + (1 + MARGIN) * width, bird.y0 + (1 + MARGIN) * height])).astype(int)
-    (x0, y0), (x1, y1) = np.maximum(low, 0).tolist(), np.minimum(high, greys[key].shape[::-1]).tolist()
+    frame_height, frame_width = greys[key].shape
+    x0, y0, x1, y1 = enlarge(bird.corners_px, MARGIN, (frame_width, frame_height)).tolist()
     crop_px = (x1 - x0, y1 - y0)
     zoom = CROP_PX / max(crop_px)
     size_px = [max(round(side * zoom), _LEAST_PX) for side in crop_px]
@@ -215,6 +214,7 @@ def _carried(bird: Instance, key: int, greys: Sequence[UInt8[np.ndarray, "H W"]]
     def crop(picture: np.ndarray) -> np.ndarray:
         return cv2.resize(picture[y0:y1, x0:x1], size_px, interpolation=resizing)
 
+    height, width = bird.mask.shape
     padded = np.zeros(crop_px[::-1], np.float32)
     padded[bird.y0 - y0 :, bird.x0 - x0 :][:height, :width] = bird.mask
     mask, here = cv2.resize(padded, size_px, interpolation=resizing), crop(greys[key])

@@ -178,10 +178,12 @@ def detect(
             yield group
 
     def detected(group: list[Frame | int]) -> list[FrameDetections | int]:
-        pictures = [item.picture for item in group if isinstance(item, Frame)]
-        # a block without a readable frame has no pictures
-        segmented = iter(block(pictures) if block and pictures else map(segmenter, pictures))
-        return [item if isinstance(item, int) else of_frame(item, next(segmented), item is group[-1]) for item in group]
+        frames = [item for item in group if isinstance(item, Frame)]
+        pictures = [frame.picture for frame in frames]
+        segmented = block(pictures) if block and frames else map(segmenter, pictures)
+        pairs = zip(frames, segmented, strict=True)
+        found = {frame.index: of_frame(frame, instances, frame is group[-1]) for frame, instances in pairs}
+        return [item if isinstance(item, int) else found[item.index] for item in group]
 
     def of_frame(frame: Frame, instances: list[Instance], ends_block: bool) -> FrameDetections:
         number, picture, time_s = frame

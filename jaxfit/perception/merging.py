@@ -10,6 +10,8 @@ from jaxtyping import Bool, UInt8
 
 from jaxfit.perception.network import Instance, Segmenter
 
+MIN_SAME_IOU = 0.5
+"""Boxes or masks with a larger IoU show the same bird, the usual limit of a match (Everingham et al. 2010)."""
 MIN_PART_SHARE = 0.5
 """Least share of a part that lies in the whole bird, and least share of a whole bird that hides it."""
 

@@ -23,9 +23,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.data.masks import box_iou
 from jaxfit.perception.carried_masks import segment_block
-from jaxfit.perception.merging import common_pixels, mask_iou, smaller_inside, tile_spans
+from jaxfit.perception.merging import MIN_SAME_IOU, common_pixels, mask_iou, smaller_inside, tile_spans
 from jaxfit.perception.network import Instance, OnnxModel, instance_of, normalise
-from jaxfit.perception.segmentation_inputs import Placement, image_input
+from jaxfit.perception.segmentation_inputs import Placement, enlarge, image_input
 from jaxfit.perception.segmentation_layouts import Detection, View, Yolox
 
 # margins on each side of a box, as shares of its sides:
@@ -37,8 +37,6 @@ DOUBTFUL_SCORE = 0.1
 """Least score of a doubtful box, as in ByteTrack (Zhang et al. 2022)."""
 MAX_DOUBTFUL = 2
 """Largest number of doubtful boxes of a frame that are segmented, to bound the time: the best ones."""
-MIN_SAME_IOU = 0.5
-"""Boxes or masks with a larger IoU show the same bird, the usual limit of a match (Everingham et al. 2010)."""
 MIN_PART = 0.9
 """Least share of the salient pixels in the largest part of a mask that counts as one object."""
 MIN_INSIDE = 0.5
@@ -183,8 +181,8 @@ class DetectorAndSaliency:
             The instance; None for a box outside the frame or without a salient object.
         """
         frame_px = (frame.shape[1], frame.shape[0])
-        crop_px = _enlarge(corners_px, CONTEXT, frame_px)
-        salient = self._salient(frame, crop_px, _enlarge(corners_px, margin, frame_px))
+        crop_px = enlarge(corners_px, CONTEXT, frame_px)
+        salient = self._salient(frame, crop_px, enlarge(corners_px, margin, frame_px))
         if salient is None:
             return None
         return instance_of(_largest_component(salient.mask), 1.0, salient.label, salient.x0, salient.y0)
@@ -204,7 +202,7 @@ class DetectorAndSaliency:
         A mask that cannot be whole is cut by its box.
         """
         frame_px, corners_px = (frame.shape[1], frame.shape[0]), detection.corners_px
-        crop_px = _enlarge(corners_px, CONTEXT, frame_px)
+        crop_px = enlarge(corners_px, CONTEXT, frame_px)
         for _ in range(1 + GROWTHS):
             salient = self._salient(frame, crop_px, crop_px, sides)
             if salient is None:
@@ -223,7 +221,7 @@ class DetectorAndSaliency:
                 has_one_part = bool(np.count_nonzero(mask) >= MIN_PART * np.count_nonzero(free))
                 return _Segmented(bird, has_one_part, crop_px)
             low, high = np.minimum(box_px, corners_px)[:2], np.maximum(box_px, corners_px)[2:]
-            crop_px = _enlarge(np.concatenate([low, high]), CONTEXT, frame_px)
+            crop_px = enlarge(np.concatenate([low, high]), CONTEXT, frame_px)
         bird = self.instance_in_box(frame, corners_px)
         if bird is None:
             return None
@@ -326,13 +324,6 @@ def _pixels(corners_px: Float[np.ndarray, "4"], instance: Instance) -> Bool[np.n
     rows, columns = (np.arange(length) + 0.5 for length in instance.mask.shape)
     x, y = instance.x0 + columns, instance.y0 + rows[:, None]
     return (x >= corners_px[0]) & (x < corners_px[2]) & (y >= corners_px[1]) & (y < corners_px[3])
-
-
-def _enlarge(corners_px: Float[np.ndarray, "4"], share: float, frame_px: tuple[int, int]) -> Int[np.ndarray, "4"]:
-    """Add margins to a box, round outwards to whole pixels, and clip to the frame."""
-    margin = np.tile(corners_px[2:] - corners_px[:2], 2) * share * [-1, -1, 1, 1]
-    low, high = np.floor(corners_px + margin)[:2], np.ceil(corners_px + margin)[2:]
-    return np.clip(np.concatenate([low, high]), 0, np.tile(frame_px, 2)).astype(int)
 
 
 def _largest_component(

@@ -277,6 +277,13 @@ class _Interpolation(NamedTuple):
         return interpolated
 
 
+def enlarge(corners_px: Float[np.ndarray, "4"], share: float, frame_px: tuple[int, int]) -> Int[np.ndarray, "4"]:
+    """Add margins to a box, round outwards to whole pixels, and clip to the frame."""
+    margin = np.tile(corners_px[2:] - corners_px[:2], 2) * share * [-1, -1, 1, 1]
+    low, high = np.floor(corners_px + margin)[:2], np.ceil(corners_px + margin)[2:]
+    return np.clip(np.concatenate([low, high]), 0, np.tile(frame_px, 2)).astype(int)
+
+
 def non_maximum_suppression(
     corners_px: Float[np.ndarray, "N 4"], scores: Float[np.ndarray, "N"], labels: Int[np.ndarray, "N"], max_iou: float
 ) -> Int[np.ndarray, "M"]:

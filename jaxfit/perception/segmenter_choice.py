@@ -25,15 +25,13 @@ from jaxfit.foundation.errors import InputError, counted
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.perception.detections import expected_frames, open_keypoint_detector, open_segmenter, single_opencv_thread
 from jaxfit.perception.general_networks import COMMAND, check_general_files, installed_general
-from jaxfit.perception.merging import mask_iou
+from jaxfit.perception.merging import MIN_SAME_IOU, mask_iou
 from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
 from jaxfit.perception.trust import FootageSignals, Trust, judge
 from jaxfit.video.reader import read_frames
 
 FRAMES = 8
 """Number of frames, spread evenly over the video, on which the segmenter is chosen."""
-MIN_IOU = 0.5
-"""Masks with a larger IoU are a pair, which is the usual limit of a matching detection (Everingham et al. 2010)."""
 
 _logger = logging.getLogger(__name__)
 
@@ -159,7 +157,7 @@ def _has_bird(segmenter: Segmenter, picture: UInt8[np.ndarray, "H W 3"]) -> bool
     """Whether a segmenter detects a bird in a picture and, at the same place, in the mirror image."""
     birds = segmenter(picture)
     mirrored = _mirrored_birds(segmenter, picture) if birds else []
-    return any(mask_iou(bird, other) > MIN_IOU for bird in birds for other in mirrored)
+    return any(mask_iou(bird, other) > MIN_SAME_IOU for bird in birds for other in mirrored)
 
 
 def _mirrored_birds(segmenter: Segmenter, picture: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:

@@ -36,13 +36,12 @@ from jaxfit.learning.networks.labels import (
 )
 from jaxfit.perception.detections import single_opencv_thread
 from jaxfit.perception.general_networks import installed_general
+from jaxfit.perception.merging import MIN_SAME_IOU
 from jaxfit.perception.network import Segmenter
 from jaxfit.perception.saliency import CONTEXT, DetectorAndSaliency
 from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.video.reader import probe_video, read_frames
 
-MIN_IOU = 0.5
-"""Masks with a larger IoU show the same bird, the usual limit of a matching detection (Everingham et al. 2010)."""
 SEEDS = 24
 """Number of frames, spread over the film, in which the teacher searches birds without labels."""
 EXAMINED = 48
@@ -226,7 +225,7 @@ def track_labels(
             label = labels.get(picture.labels.frame)
             if label is None:
                 result.pictures.append(picture._replace(labels=picture.labels._replace(source=source)))
-            elif is_unbroken and _iou(_bird_pixels(label), _bird_pixels(picture.labels)) <= MIN_IOU:
+            elif is_unbroken and _iou(_bird_pixels(label), _bird_pixels(picture.labels)) <= MIN_SAME_IOU:
                 result.wrong.append(label)
     return result._replace(confirmed=confirmed)
 
@@ -343,7 +342,7 @@ def _walk(
             continue
         moved = [_resized(mask, film.size_px) > 0.5 for mask in carried]
         birds, others = _segment(teacher, film.picture(number), moved)
-        lost = [_iou(mask, before) <= MIN_IOU for mask, before in zip(birds, moved, strict=True)]
+        lost = [_iou(mask, before) <= MIN_SAME_IOU for mask, before in zip(birds, moved, strict=True)]
         if any(lost) or misses > MAX_MISSES:
             is_unbroken = False
             lost = [misses > MAX_MISSES or is_lost for is_lost in lost]
@@ -429,7 +428,7 @@ def _pairs(first: Sequence[Mask], second: Sequence[Mask]) -> list[tuple[int, int
     """Return the pairs of masks of the same bird."""
     ious = np.array([[_iou(a, b) for b in second] for a in first]).reshape(len(first), len(second))
     places = linear_sum_assignment(ious, maximize=True)
-    return [(int(i), int(j)) for i, j in zip(*places, strict=True) if ious[i, j] > MIN_IOU]
+    return [(int(i), int(j)) for i, j in zip(*places, strict=True) if ious[i, j] > MIN_SAME_IOU]
 
 
 def _iou(first: Mask, second: Mask) -> float:
