@@ -61,10 +61,8 @@ class _Tally(NamedTuple):
     birds: list[Instance]
     sources: list[set[_Source]]
     """For each bird, the sources of all votes at its place."""
-    agreed: list[set[_Source]]
-    """For each bird, the sources of the votes that agree with its mask."""
-    rest: list[set[_Source]]
-    """For each place where votes do not agree, their sources."""
+    is_open: bool
+    """Whether the votes at another place do not agree."""
 
 
 def segment_block(
@@ -83,34 +81,29 @@ def segment_block(
     num_frames = len(frames)
     votes: list[list[_Vote]] = [[] for _ in frames]
     added = sorted({(2 * part + 1) * num_frames // (2 * VOTES) for part in range(VOTES)})  # the middles of equal parts
-    known = dict.fromkeys(added, _Tally([], [], [], []))  # key frame → result of the votes before
+    known = dict.fromkeys(added, _Tally([], [], False))  # key frame → result of the votes before
     while True:
         for key in added:
             for number, bird in enumerate(segment(frames[key], known[key].birds)):
                 for n, mask in enumerate(_carried(bird, key, greys)):
                     if mask is not None:
                         votes[n].append(_Vote((key, number), mask))
-        tallies, is_open = _tally_block(votes, known)
-        open_frames = [n for n in range(num_frames) if is_open[n] and n not in known]
+        tallies = _tally_block(votes, known)
+        open_frames = [n for n in range(num_frames) if tallies[n].is_open and n not in known]
         if not open_frames:
             return [sorted(of_frame.birds, key=lambda bird: -bird.score) for of_frame in tallies]
         added = [max(open_frames, key=lambda n: min(abs(n - key) for key in known))]
         known |= {key: tallies[key] for key in added}
 
 
-def _tally_block(votes: Sequence[Sequence[_Vote]], known: Mapping[int, _Tally]) -> tuple[list[_Tally], list[bool]]:
+def _tally_block(votes: Sequence[Sequence[_Vote]], known: Mapping[int, _Tally]) -> list[_Tally]:
     """Count the votes of all frames. A bird is not carried beyond a key frame in which it is not.
 
     Args:
         votes: the votes in each frame.
         known: key frame → birds that the segmenter was not asked for.
-
-    Returns:
-        The results, and whether a bird of the frame is open: its votes do not agree, and no bird of this frame has
-        these sources.
     """
     at_keys = {key: _tally_frame(key, votes[key], known) for key in known}
-    together = [sources for tally in at_keys.values() for sources in tally.agreed]
 
     def reaches(vote: _Vote, n: int) -> bool:
         between = (key for key in known if min(vote.key, n) < key < max(vote.key, n))
@@ -121,15 +114,12 @@ def _tally_block(votes: Sequence[Sequence[_Vote]], known: Mapping[int, _Tally]) 
         if n in at_keys:
             tallies.append(at_keys[n])
             continue
-        tallies.append(_tally_frame(n, [vote for vote in of_frame if reaches(vote, n)], known))
-        if n < min(known) or n > max(known):  # the segmenter may have missed the bird in the first or last key frame
-            tallies[n].rest.extend({vote.source} for vote in of_frame if not reaches(vote, n))
-
-    def is_counted(rest: set[_Source], tally: _Tally) -> bool:
-        same = rest.union(*(sources for sources in together if sources & rest))
-        return any(sources & same for sources in tally.agreed)
-
-    return tallies, [not all(is_counted(rest, tally) for rest in tally.rest) for tally in tallies]
+        reaching = [vote for vote in of_frame if reaches(vote, n)]
+        tally = _tally_frame(n, reaching, known)
+        # the segmenter may have missed a bird in the first or last key frame
+        is_stopped = len(reaching) < len(of_frame) and not min(known) < n < max(known)
+        tallies.append(tally._replace(is_open=tally.is_open or is_stopped))
+    return tallies
 
 
 def _tally_frame(n: int, votes: Sequence[_Vote], known: Mapping[int, _Tally]) -> _Tally:
@@ -149,7 +139,7 @@ def _tally_frame(n: int, votes: Sequence[_Vote], known: Mapping[int, _Tally]) ->
     around = (
         [n] if n in known else [max(filter(n.__gt__, known), default=None), min(filter(n.__lt__, known), default=None)]
     )
-    result = _Tally([], [], [], [])
+    birds, places, is_open = list[Instance](), list[set[_Source]](), False
     for group in groups:
         sources = {vote.source for vote in group}
         one_side_suffices = any(
@@ -166,15 +156,14 @@ def _tally_frame(n: int, votes: Sequence[_Vote], known: Mapping[int, _Tally]) ->
             )
         ]
         if group[0].key != n and not agreed:
-            result.rest.append(sources)
+            is_open = True
             continue
         bird = group[0].bird if group[0].key == n else _majority(agreed[:VOTES])
-        if any(mask_iou(bird, other) > MIN_SAME_IOU for other in result.birds):  # hidden behind the other bird
+        if any(mask_iou(bird, other) > MIN_SAME_IOU for other in birds):  # hidden behind the other bird
             continue
-        result.birds.append(bird)
-        result.sources.append(sources)
-        result.agreed.append({vote.source for vote in group if mask_iou(vote.bird, bird) > AGREED_IOU})
-    return result
+        birds.append(bird)
+        places.append(sources)
+    return _Tally(birds, places, is_open)
 
 
 def _same_iou(vote: _Vote, group: Sequence[_Vote]) -> float:

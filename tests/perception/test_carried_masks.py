@@ -123,6 +123,14 @@ def test_a_bird_that_flow_cannot_follow_is_segmented_in_every_frame_and_others_a
     assert_masks(found, scene, 0.9)
 
 
+def test_a_bird_that_jumps_once_is_sought_in_the_middle_between_key_frames():
+    scene = Scene([[(80, 60)] if n < 10 else [(240, 140)] for n in range(BLOCK_FRAMES)])
+    assert_masks(scene.segment(), scene, 0.9)
+    asked = {n for n, _ in scene.calls}
+    assert 9 in asked
+    assert 8 not in asked  # votes of 7 and 9 agree
+
+
 def test_a_bird_that_comes_and_a_bird_that_leaves():
     places = [[(80, 60)] * (n < 6) + [(240, 140)] * (n >= 9) for n in range(BLOCK_FRAMES)]
     scene = Scene(places)
