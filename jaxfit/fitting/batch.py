@@ -80,6 +80,8 @@ class Batch(NamedTuple):
     """Of the body that each initial pose has (`fitting/bodies.py`); None without given bodies."""
     keypoint_scale: Float[np.ndarray, "S"] | None = None
     """Of the keypoint errors of the track, as a multiple of the scale in the config; None without given bodies."""
+    tells_body: bool = True
+    """Whether the bodies are estimated from these windows."""
 
 
 class FittedWindow(NamedTuple):
@@ -108,7 +110,7 @@ def fit_batch(
     """Run the stages on a batch of problems. The result of a problem does not depend on the other problems.
 
     If a stage shares the body (`share_body`), the stages up to this stage run for a batch without given bodies, and
-    the later stages for a batch with bodies.
+    the later stages for a batch with bodies. The stage itself runs only for windows that tell the body.
 
     Args:
         model: the bird and the camera.
@@ -119,7 +121,8 @@ def fit_batch(
     Returns:
         The results of all problems, with a leading axis B, in the order of the batch.
     """
-    initial, stages = batch.initial_pose, stages_of_pass(configs[0], batch.body_covariance is not None)
+    initial = batch.initial_pose
+    stages = stages_of_pass(configs[0], batch.body_covariance is not None, batch.tells_body)
     last = stages[-1]
     count, hypotheses, frames = initial.global_orient.shape[:3]
     pose = jax.tree.map(lambda x: np.asarray(x).reshape(count * hypotheses, *x.shape[2:]), initial)
@@ -149,7 +152,7 @@ def fit_batch(
         run = _stage_run(stage, program, rows, hyperparameters, batch, first)
         found = run.of_tiles(body_evidence, run.taken(rows.pose))
         body = _stacked(run, rows, found, "a window says nothing about the body of its bird")
-    elif configs[0].error_bars:
+    elif configs[0].error_bars and last == len(configs[0].stages) - 1:
         covariance, used = None, stage
         if batch.body_covariance is not None:
             names = shared_parameters(configs[0].stages[stages[0] - 1])

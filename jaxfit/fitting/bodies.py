@@ -80,6 +80,8 @@ ASYMMETRY_SD = 0.01
 LONGEST = 3.0
 """Largest length of an error, in units of the median of its window: outliers do not decide n_eff."""
 
+BODY_FRAMES = 800
+"""Most frames of a track that its body is estimated from."""
 COMMON_POSTURE = 0.5
 """Share of the variance of a lasting posture that all birds of a film have in common, for the offsets of keypoints:
 birds of one film do the same in the same place, and nothing says how much."""
@@ -135,12 +137,33 @@ class Body(NamedTuple):
     """Whether the first and the second half of the windows agree about the body; they disagree for two birds."""
 
 
-def stages_of_pass(config: FitConfig, has_bodies: bool) -> range:
-    """Return the positions of the stages before the bodies are known, or with given bodies."""
+def stages_of_pass(config: FitConfig, has_bodies: bool, tells_body: bool = True) -> range:
+    """Return the positions of the stages before the bodies are known, or with given bodies.
+
+    Args:
+        config: the config.
+        has_bodies: whether the bodies are known.
+        tells_body: whether the bodies are estimated from the windows; if not, the stage that shares the body is left out.
+    """
     if config.body_stage is None:
         return range(len(config.stages))
     after = config.body_stage + 1
-    return range(after, len(config.stages)) if has_bodies else range(after)
+    return range(after, len(config.stages)) if has_bodies else range(after if tells_body else after - 1)
+
+
+def windows_of_bodies(track: Int[np.ndarray, "W"], config: FitConfig) -> Bool[np.ndarray, "W"]:
+    """Return the windows that the bodies are estimated from: of each track, at most `BODY_FRAMES` frames, evenly spaced.
+
+    Args:
+        track: the position of the track of each window; windows of a track are in the order of time.
+        config: the config.
+    """
+    most = max(BODY_FRAMES // config.window, 2)  # two windows show whether they are of one bird
+    chosen = np.full(len(track), config.body_stage in (None, 0))  # without a stage before, every window is fitted
+    for n in np.unique(track):
+        rows = np.flatnonzero(track == n)
+        chosen[rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)]] = True
+    return chosen
 
 
 def _body_numbers(config: FitConfig) -> tuple[str, ...]:
@@ -204,7 +227,7 @@ def estimate_bodies(
 
     Args:
         track: the position of the track of each window.
-        evidence: of each window; None for a window that failed.
+        evidence: of each window; None for a window that failed or was not asked.
         model: the model of the fit.
         config: the config, whose shared stage has the weights of the priors.
         species: number of the species of each track; None for one species.

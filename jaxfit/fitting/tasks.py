@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxfit.config.fit import FitConfig, InitialiseConfig
 from jaxfit.fitting.batch import Batch, FittedWindow, fit_batch, frames_per_batch
-from jaxfit.fitting.bodies import Body, estimate_bodies, stages_of_pass
+from jaxfit.fitting.bodies import Body, estimate_bodies, stages_of_pass, windows_of_bodies
 from jaxfit.fitting.initial_poses import search_initial_poses
 from jaxfit.fitting.solve import FitModel, needs_mask
 from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
@@ -55,6 +55,13 @@ class FitTask(NamedTuple):
     """Run and row of the window in the windows of the run."""
     starts: Mapping[tuple[int, int], Start] | None = None
     """The start of each problem with a given body; None before the bodies are known."""
+    tells_body: bool = True
+    """Whether the bodies are estimated from these problems."""
+
+    @property
+    def stages(self) -> range:
+        """Positions of the stages that run."""
+        return stages_of_pass(self.configs[0], self.starts is not None, self.tells_body)
 
     def part(self, problems: Sequence[tuple[int, int]]) -> FitTask:
         """Return some problems, with only the windows that they need.
@@ -71,7 +78,7 @@ class FitTask(NamedTuple):
         starts = None
         if self.starts is not None:
             starts = {new: self.starts[old] for new, old in zip(own, problems, strict=True)}
-        return FitTask(self.configs, windows, own, starts)
+        return FitTask(self.configs, windows, own, starts, self.tells_body)
 
 
 def _no_report(_steps: float, _note: str) -> None:
@@ -163,7 +170,7 @@ def gather_batch(model: FitModel, task: FitTask) -> Batch:
         pose = jax.tree.map(lambda x: x[:, None], pose)  # one hypothesis
         return Batch(targets, pose, runs, targets_row, np.arange(len(starts)), ambiguity_deg, *of_bodies)
     poses, pose_row = _prepare_rows(task, pose_key, lambda windows, config: initial_poses_of(windows, config, model))
-    return Batch(targets, poses, runs, targets_row, pose_row)
+    return Batch(targets, poses, runs, targets_row, pose_row, tells_body=task.tells_body)
 
 
 def _prepare_rows(
@@ -233,8 +240,8 @@ def fit_windows(
 ) -> Fitted:
     """Fit the problems of a fit in batches, with progress, and store the windows of every batch when they are fitted.
 
-    If a stage shares the body, the windows are fitted up to this stage, the bodies are estimated from all windows of a
-    track, and the windows are fitted with the later stages.
+    If a stage shares the body, the windows are fitted up to this stage, the bodies are estimated, and the windows are
+    fitted with the later stages. Only `windows_of_bodies` run the stage itself.
 
     Args:
         task: all problems.
@@ -254,7 +261,12 @@ def fit_windows(
     def run(task: FitTask, subject: str) -> dict[tuple[int, int], FittedWindow]:
         return _fit_pass(task, model, birds, subject, progress, stored, cluster)
 
-    windows = run(task, subject)
+    telling = [windows_of_bodies(of_run.track, c) for of_run, c in zip(task.windows, task.configs, strict=True)]
+    first = task._replace(problems=[(r, w) for r, w in task.problems if telling[r][w]])
+    others = task._replace(problems=[(r, w) for r, w in task.problems if not telling[r][w]], tells_body=False)
+    windows = run(first, subject)
+    if others.problems:
+        windows |= run(others, f"other windows of {subject}")
     if task.configs[0].body_stage is None:
         return Fitted(windows, [{} for _ in task.configs])
     bodies, starts = [], {}
@@ -289,12 +301,13 @@ def _fit_pass(
     """Fit the problems of one pass: before the bodies are known, or with given bodies."""
     config, results, contents = task.configs[0], {}, {}
     if stored is not None:
-        contents = {w: b"" if task.starts is None else task.starts[r, w].content for r, w in task.problems}
+        own = {w: b"" if task.starts is None else task.starts[r, w].content for r, w in task.problems}
+        contents = {w: bytes(task.stages) + content for w, content in own.items()}
         results = {(0, w): window for w, window in stored.find(task.windows[0], contents).items()}
         task = task._replace(problems=[problem for problem in task.problems if problem not in results])
     batches = _in_batches(task, model, birds, stored is not None, cluster is not None)
     _logger.info("%s, %d windows of %d frames, %d batches", subject, len(task.problems), config.window, len(batches))
-    steps = sum(config.stages[i].steps for i in stages_of_pass(config, task.starts is not None))
+    steps = sum(config.stages[i].steps for i in task.stages)
     with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
         parts = (task.part(batch) for batch in batches)
         fitted = _fit_here(parts, model, report_progress)

@@ -25,6 +25,7 @@ from jaxfit.fitting.bodies import (
     _symmetric,
     bodies_of,
     estimate_bodies,
+    windows_of_bodies,
 )
 from jaxfit.fitting.error_bars import _with_body
 from jaxfit.fitting.fit import fit, fit_runs, learn_weights, model_of_fit
@@ -398,13 +399,55 @@ def test_bodies_do_not_depend_on_other_birds(fitted):
     np.testing.assert_array_equal(alone.poses.body_pose[0], together.poses.body_pose[1])
 
 
+@pytest.fixture
+def two_windows_tell(monkeypatch):
+    """Bodies are estimated from the first and the last window of a track."""
+    monkeypatch.setattr(bodies, "BODY_FRAMES", 2 * T)
+
+
+def test_windows_that_tell_the_body_are_evenly_spaced(monkeypatch):
+    monkeypatch.setattr(bodies, "BODY_FRAMES", 3 * T)
+    track = np.repeat([0, 1, 2], [7, 2, 3])
+    chosen = windows_of_bodies(track, CONFIG)
+    assert np.flatnonzero(chosen).tolist() == [0, 3, 6, *range(7, 12)]
+    assert windows_of_bodies(track, config()).all()  # no stage shares a body
+    # no stage before the bodies would give the other windows their poses
+    assert windows_of_bodies(track, dataclasses.replace(CONFIG, stages=stages()[1:])).all()
+
+
+def test_bodies_of_long_tracks_are_those_of_some_windows(two_windows_tell):
+    observed = detect(BIRD, individuals(4 * T), 0.1, 0.0, 0, camera=CAMERA)
+    settings = dataclasses.replace(CONFIG, error_bars=True)
+    solution = fit(observed, BIRD, settings)
+    # the oracle: a fit that has no other windows
+    (some,) = fit_runs(observed, BIRD, [settings], select=np.array([0, 3, 4, 7]))
+    for name, values in vars(some.bodies).items():
+        np.testing.assert_array_equal(getattr(solution.bodies, name), values, err_msg=name)
+    assert solution.valid.all()
+    assert (solution.poses.bone_length == solution.bodies.bone_length[:, None]).all()
+    assert np.isfinite(solution.error_bars.keypoints_px_cov).all()
+    error_px = np.linalg.norm(solution.keypoints.px - observed.keypoints_px, axis=-1).mean((0, 2)).reshape(4, T).mean(1)
+    assert error_px[1:3].max() < 1.1 * error_px[[0, 3]].max()
+
+
+def test_interrupted_where_some_windows_tell_the_body(two_windows_tell, tmp_path):
+    observed = detect(BIRD, individuals(4 * T), 0.1, 0.0, 0, camera=CAMERA)
+    expected = fit(observed, BIRD, CONFIG)
+    fit(observed.select(tracks=[0]), BIRD, CONFIG, stored=StoredWindows(Parts(tmp_path, {})))
+    stored = StoredWindows(Parts(tmp_path, {}))
+    again = fit(observed, BIRD, CONFIG, stored=stored)
+    assert stored.state == "16 windows fitted"  # eight windows in two passes
+    for name, values in expected.arrays().items():
+        np.testing.assert_array_equal(again.arrays()[name], values, err_msg=name)
+
+
 def test_interrupted_between_the_passes(fitted, tmp_path):
     observed, solution = fitted
     settings, add = dataclasses.replace(CONFIG, error_bars=True), StoredWindows.add
 
     def stopped(self, windows, results, contents):
         add(self, windows, results, contents)
-        if any(contents.values()):  # of the second pass
+        if any(len(content) > len(CONFIG.stages) for content in contents.values()):  # of the second pass
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
