@@ -139,7 +139,7 @@ class Triangulated(_Arrays):
 
 @dataclass(frozen=True, eq=False)
 class Bodies(_Arrays):
-    """One body for each track, from all its windows (`fitting/bodies.py`); NaN for tracks without a fitted window."""
+    """One body for each track (`fitting/bodies.py`); NaN for tracks without a fitted window."""
 
     bone_length: Float32[np.ndarray, "N bones"]
     """Relative to the rest skeleton."""

@@ -1,4 +1,4 @@
-"""Bodies: bone lengths and shape of each bird from all windows of its track.
+"""Bodies: bone lengths and shape of each bird from windows of its whole track.
 
 A stage with `share_body` optimises bone lengths and shape in every window, with the priors of the model. For a window,
 let A be the marginal precision of these numbers b (the poses integrated out, `fitting/posterior.py`), P the precision
@@ -68,7 +68,7 @@ from jaxfit.fitting.keypoint_offsets import longest_distance, offset_directions
 from jaxfit.fitting.posterior import BROAD_BONE_SD, BROAD_SHAPE_SD, window_posteriors
 from jaxfit.fitting.problem import Problem, Program
 from jaxfit.fitting.sandwich import constant_deviation
-from jaxfit.fitting.solve import FitModel, shared_parameters
+from jaxfit.fitting.solve import FitModel, needs_mask, shared_parameters
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.posed_window import Priors
@@ -81,7 +81,9 @@ LONGEST = 3.0
 """Largest length of an error, in units of the median of its window: outliers do not decide n_eff."""
 
 BODY_FRAMES = 800
-"""Most frames of a track that its body is estimated from."""
+"""Most frames of a track that its body is estimated from. Because errors agree between frames, 1,500 frames are worth
+3 to 20 (n_eff), and a body from 800 of them differs by a tenth of the variance of the body (docs/method/bodies.md)."""
+
 COMMON_POSTURE = 0.5
 """Share of the variance of a lasting posture that all birds of a film have in common, for the offsets of keypoints:
 birds of one film do the same in the same place, and nothing says how much."""
@@ -143,23 +145,31 @@ def stages_of_pass(config: FitConfig, has_bodies: bool, tells_body: bool = True)
     Args:
         config: the config.
         has_bodies: whether the bodies are known.
-        tells_body: whether the bodies are estimated from the windows; if not, the stage that shares the body is left out.
+        tells_body: whether the bodies are estimated from the windows. If not, the first pass only finds poses to begin
+            with: the stages that share the body or compare masks, and those between, are left out.
     """
-    if config.body_stage is None:
+    shared = config.body_stage
+    if shared is None:
         return range(len(config.stages))
-    after = config.body_stage + 1
-    return range(after, len(config.stages)) if has_bodies else range(after if tells_body else after - 1)
+    if has_bodies:
+        return range(shared + 1, len(config.stages))
+    if tells_body:
+        return range(shared + 1)
+    return range(next(i for i, stage in enumerate(config.stages) if i == shared or needs_mask(stage)))
 
 
 def windows_of_bodies(track: Int[np.ndarray, "W"], config: FitConfig) -> Bool[np.ndarray, "W"]:
-    """Return the windows that the bodies are estimated from: of each track, at most `BODY_FRAMES` frames, evenly spaced.
+    """Return the windows that the bodies are estimated from: of each track, evenly spaced windows of at most
+    `BODY_FRAMES` frames in all.
 
     Args:
         track: the position of the track of each window; windows of a track are in the order of time.
         config: the config.
     """
     most = max(BODY_FRAMES // config.window, 2)  # two windows show whether they are of one bird
-    chosen = np.full(len(track), config.body_stage in (None, 0))  # without a stage before, every window is fitted
+    # without stages for the other windows, all windows count
+    no_others = config.body_stage is None or not stages_of_pass(config, has_bodies=False, tells_body=False)
+    chosen = np.full(len(track), no_others)
     for n in np.unique(track):
         rows = np.flatnonzero(track == n)
         chosen[rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)]] = True
