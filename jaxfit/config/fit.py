@@ -145,7 +145,8 @@ class StageConfig:
     share_body: bool | Literal["species"] = False
     """Whether the bone lengths and the shape that this stage optimises in every window become one body for each track
     (docs/method/bodies.md). The later stages keep the body. `species`: the bodies of tracks of one species, such as
-    photographs, are also similar, as far as the data say."""
+    photographs, are also similar, as far as the data say. Most windows of a long track skip this stage and the stages
+    from the first with masks on, so the later stages need enough steps without them."""
 
     def __post_init__(self):
         for name in self.terms:

@@ -81,8 +81,9 @@ LONGEST = 3.0
 """Largest length of an error, in units of the median of its window: outliers do not decide n_eff."""
 
 BODY_FRAMES = 800
-"""Most frames of a track that its body is estimated from. Because errors agree between frames, 1,500 frames are worth
-3 to 20 (n_eff), and a body from 800 of them differs by a tenth of the variance of the body (docs/method/bodies.md)."""
+"""Most frames, of all windows together, that the body of a track is estimated from. Because errors agree between
+frames, the 1,500 frames of a measured film are worth 3 to 20 (n_eff), so further windows change little
+(docs/method/bodies.md)."""
 
 COMMON_POSTURE = 0.5
 """Share of the variance of a lasting posture that all birds of a film have in common, for the offsets of keypoints:
@@ -160,16 +161,17 @@ def stages_of_pass(config: FitConfig, has_bodies: bool, tells_body: bool = True)
 
 def windows_of_bodies(track: Int[np.ndarray, "W"], config: FitConfig) -> Bool[np.ndarray, "W"]:
     """Return the windows that the bodies are estimated from: of each track, evenly spaced windows of at most
-    `BODY_FRAMES` frames in all.
+    `BODY_FRAMES` frames in all, and two at least. If all of them diverge, the body is that of the model.
 
     Args:
         track: the position of the track of each window; windows of a track are in the order of time.
         config: the config.
     """
     most = max(BODY_FRAMES // config.window, 2)  # two windows show whether they are of one bird
-    # without stages for the other windows, all windows count
-    no_others = config.body_stage is None or not stages_of_pass(config, has_bodies=False, tells_body=False)
-    chosen = np.full(len(track), no_others)
+    others = stages_of_pass(config, has_bodies=False, tells_body=False)
+    left_out = config.stages[len(others) : len(stages_of_pass(config, has_bodies=False))]
+    # all windows run all stages where the others would have no stage, or where a stage chooses their hypothesis
+    chosen = np.full(len(track), not others or not left_out or any(stage.keep_best for stage in left_out))
     for n in np.unique(track):
         rows = np.flatnonzero(track == n)
         chosen[rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)]] = True

@@ -25,14 +25,15 @@ from jaxfit.fitting.bodies import (
     _symmetric,
     bodies_of,
     estimate_bodies,
+    stages_of_pass,
     windows_of_bodies,
 )
-from jaxfit.fitting.error_bars import _with_body
+from jaxfit.fitting.error_bars import _with_body, window_error_bars
 from jaxfit.fitting.fit import fit, fit_runs, learn_weights, model_of_fit
 from jaxfit.fitting.initial_poses import load_initial_poses
 from jaxfit.fitting.keypoint_offsets import offset_directions
 from jaxfit.fitting.posterior import BodySensitivity
-from jaxfit.fitting.solve import fit_model
+from jaxfit.fitting.solve import fit_model, without_mask_stages
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.unfinished import Parts
@@ -413,12 +414,34 @@ def test_windows_that_tell_the_body_are_evenly_spaced(monkeypatch):
     assert windows_of_bodies(track, config()).all()  # no stage shares a body
     # no stage before the bodies would give the other windows their poses
     assert windows_of_bodies(track, dataclasses.replace(CONFIG, stages=stages()[1:])).all()
+    # a stage that the others skip chooses the hypothesis
+    first, shared, last = stages()
+    choosing = dataclasses.replace(CONFIG, stages=(first, dataclasses.replace(shared, keep_best=True), last))
+    assert windows_of_bodies(track, choosing).all()
 
 
-def test_bodies_of_long_tracks_are_those_of_some_windows(two_windows_tell):
+def test_stages_of_windows_that_tell_no_body():
+    map_, photo = load_config("map"), load_config("photo")
+    for settings, names in (
+        (map_, ["keypoints"]),
+        (without_mask_stages(map_), ["keypoints", "mask"]),
+        (photo, ["camera", "pose"]),
+    ):
+        some = stages_of_pass(settings, has_bodies=False, tells_body=False)
+        assert [settings.stages[i].name for i in some] == names
+
+
+def test_bodies_of_long_tracks_are_those_of_some_windows(two_windows_tell, monkeypatch):
     observed = detect(BIRD, individuals(4 * T), 0.1, 0.0, 0, camera=CAMERA)
-    settings = dataclasses.replace(CONFIG, error_bars=True)
+    settings, calls = dataclasses.replace(CONFIG, error_bars=True), []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return window_error_bars(*arguments)
+
+    monkeypatch.setattr("jaxfit.fitting.batch.window_error_bars", counted)
     solution = fit(observed, BIRD, settings)
+    assert all(of_bodies is not None for *_, of_bodies in calls)  # only with the bodies
     # the oracle: a fit that has no other windows
     (some,) = fit_runs(observed, BIRD, [settings], select=np.array([0, 3, 4, 7]))
     for name, values in vars(some.bodies).items():
@@ -430,15 +453,27 @@ def test_bodies_of_long_tracks_are_those_of_some_windows(two_windows_tell):
     assert error_px[1:3].max() < 1.1 * error_px[[0, 3]].max()
 
 
-def test_interrupted_where_some_windows_tell_the_body(two_windows_tell, tmp_path):
+def test_interrupted_where_some_windows_tell_the_body(two_windows_tell, tmp_path, monkeypatch):
     observed = detect(BIRD, individuals(4 * T), 0.1, 0.0, 0, camera=CAMERA)
     expected = fit(observed, BIRD, CONFIG)
-    fit(observed.select(tracks=[0]), BIRD, CONFIG, stored=StoredWindows(Parts(tmp_path, {})))
-    stored = StoredWindows(Parts(tmp_path, {}))
-    again = fit(observed, BIRD, CONFIG, stored=stored)
-    assert stored.state == "16 windows fitted"  # eight windows in two passes
+    fit(observed.select(tracks=[0]), BIRD, CONFIG, stored=StoredWindows(Parts(tmp_path / "first", {})))
+    added = []
+
+    class Counted(StoredWindows):
+        def add(self, windows, results, contents):
+            added.extend(results)
+            super().add(windows, results, contents)
+
+    again = fit(observed, BIRD, CONFIG, stored=Counted(Parts(tmp_path / "first", {})))
+    assert sorted(added) == [4, 4, 5, 5, 6, 6, 7, 7]  # the second bird, in two passes
+    # the same windows where all tell the body have other stages
+    monkeypatch.setattr(bodies, "BODY_FRAMES", 4 * T)
+    fit(observed, BIRD, CONFIG, stored=StoredWindows(Parts(tmp_path / "all", {})))
+    monkeypatch.setattr(bodies, "BODY_FRAMES", 2 * T)
+    changed = fit(observed, BIRD, CONFIG, stored=StoredWindows(Parts(tmp_path / "all", {})))
     for name, values in expected.arrays().items():
         np.testing.assert_array_equal(again.arrays()[name], values, err_msg=name)
+        np.testing.assert_array_equal(changed.arrays()[name], values, err_msg=name)
 
 
 def test_interrupted_between_the_passes(fitted, tmp_path):
